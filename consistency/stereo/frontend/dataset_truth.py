@@ -11,7 +11,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.file_kinds import is_drive
 from consistency.referee.readers.formats.kitti_files import BODIES, NANO, drive_poses, place_of, read_times
-from consistency.referee.readers.formats.tum import UNIT, read_trajectory
+from consistency.referee.readers.formats.rotations import UNIT
+from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.camera_pair import CAMERA_0, EUROC_BODY

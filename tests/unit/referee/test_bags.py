@@ -1,6 +1,8 @@
 """Bags of ROS 1 and ROS 2, written by rosbags and judged."""
 
 import contextlib
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.ros_bag import _lines
 
 pytest.importorskip("rosbags", reason="needs the extra 'ros'")
 
@@ -243,3 +247,33 @@ def test_the_covariance_of_a_true_message(tmp_path):
     for value, said in (("P.txt", "with a bag it is 'columns'"), ("columns", "the messages of map:body state none")):
         with pytest.raises(cs.InputError, match=said):
             read_recordings(drive, truth_topic="map:body", truth_covariance=value)
+
+
+class Tree:
+    """A reader of transforms along x: by parent and child their times, s, and positions, m."""
+
+    connections = (SimpleNamespace(topic="/tf", msgtype="tf2_msgs/msg/TFMessage"),)
+
+    def __init__(self, **links):
+        self.links = links
+
+    def messages(self, connections):
+        for link, (times, positions) in self.links.items():
+            frame, child = link.split("_to_")
+            for t, x in zip(times, positions, strict=True):
+                stamp = SimpleNamespace(sec=int(t), nanosec=round(1e9 * (t - int(t))))
+                header = SimpleNamespace(frame_id=frame, stamp=stamp)
+                turn = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+                transform = SimpleNamespace(translation=SimpleNamespace(x=x, y=0.0, z=0.0), rotation=turn)
+                each = SimpleNamespace(header=header, child_frame_id=child, transform=transform)
+                yield connections[0], 0, SimpleNamespace(transforms=[each])
+
+    def deserialize(self, raw, kind):
+        return raw
+
+
+def test_links_that_are_never_known_together_are_refused():
+    early, late = np.arange(3.0), np.arange(5.0, 9.0)
+    tree = Tree(map_to_odom=(early, early), odom_to_base=(late, late))
+    with pytest.raises(InputError, match="--truth-topic map:base: its links are at no time known together"):
+        _lines(Path("b"), tree, "map:base")

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,27 +18,54 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.formats.innovation_files import NisLog, choose
-from consistency.referee.readers.formats.px4_log import MICRO, Pairs, nis_of, require_in_order
+from consistency.referee.readers.formats.innovation_files import NisLog, choose, numbered_log
+from consistency.referee.readers.formats.logged_innovations import MICRO, Pairs, require_in_order
 from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
 SUFFIX = ".bin"
 BEGIN = b"\xa3\x95\x80"  # of the message that declares the first format
 EKFS = {"XKF4": "EK3", "NKF4": "EK2"}  # message with the test ratios, and the prefix of the filter's parameters
-# by sensor: the field, how many components it covers at most, the parameters of its gates
-RATIOS = {
-    "vel": ("SV", 3, ("VEL",)),
-    "pos": ("SP", 2, ("POS",)),
-    "hgt": ("SH", 1, ("HGT",)),
-    "mag": ("SM", 4, ("MAG", "YAW")),
-    "tas": ("SVT", 1, ("EAS",)),
-}
 TILT = "NKF4"  # whose SVT is a measure of the tilt error
-# by sensor: the message, innovations, variances, and the power that makes these variances
-STATED = {"odometry": ("XKFD", "IX IY IZ", "IVX IVY IVZ", 1), "beacon": ("XKF0", "innov", "SIV", 2)}
 CORE = "C"  # field of the instance of the EKF
 LEAST = 1.0  # sigma, of a gate: ArduPilot takes a smaller one for it
+
+
+class Ratio(NamedTuple):
+    """Test ratios of a sensor."""
+
+    field: str
+    components: int  # that it covers at most
+    gates: tuple[str, ...]  # parameters
+
+
+class Stated(NamedTuple):
+    """Innovations of a sensor with their variances."""
+
+    message: str
+    innovations: tuple[str, ...]
+    variances: tuple[str, ...]
+    power: int  # that makes these variances
+
+
+RATIOS = {
+    "vel": Ratio("SV", 3, ("VEL",)),
+    "pos": Ratio("SP", 2, ("POS",)),
+    "hgt": Ratio("SH", 1, ("HGT",)),
+    "mag": Ratio("SM", 4, ("MAG", "YAW")),
+    "tas": Ratio("SVT", 1, ("EAS",)),
+}  # by sensor
+STATED = {
+    "odometry": Stated("XKFD", ("IX", "IY", "IZ"), ("IVX", "IVY", "IVZ"), 1),
+    "beacon": Stated("XKF0", ("innov",), ("SIV",), 2),
+}  # by sensor
+
+
+class Messages(NamedTuple):
+    """Messages of a kind and of one instance of the EKF, N of them."""
+
+    t: Array  # (N,), s, not decreasing
+    fields: dict[str, Array]  # (N,), 0 where a message lacks one
 
 
 def is_dataflash(path: Path) -> bool:
@@ -62,27 +91,24 @@ def read_ratios(path: Path, sensor: str | None = None, core: int | None = None) 
 
     Source: ardupilot.org, "Onboard Message Log Messages" (XKF4, NKF4) and "Complete Parameter List" (EK3_POS_I_GATE).
     """
-    wanted = {name: [field for field, _, _ in RATIOS.values()] for name in EKFS}
-    found, gates = _loaded(path, wanted)
-    message = next((name for name in EKFS if found[name]), None)
+    log = _Log(path, EKFS)
+    message = next((name for name in EKFS if log.rows[name]), None)
     if message is None:
         raise InputError(f"{path}: holds no message {' or '.join(EKFS)}; log it with LOG_BITMASK, bit of the EKF")
-    rows = _of_core(path, found[message], core)
-    t = _times(path, message, rows)
+    t, fields = log.messages(message, core, [ratio.field for ratio in RATIOS.values()])
     ratios = []
-    for name, (field, components, keys) in RATIOS.items():
-        values = np.array([row.get(field, 0.0) for row in rows], float)
-        fused = np.isfinite(values) & (np.cumsum(values > 0) > 0)
-        if fused.any() and not (field == "SVT" and message == TILT):
-            stated = [gates[key] for key in (f"{EKFS[message]}_{key}_I_GATE" for key in keys) if key in gates]
-            gate = max(LEAST, min(stated) / 100.0) if stated else np.nan
-            ratios.append(GateRatios(name, t[fused], values[fused], gate, components))
+    for name, ratio in RATIOS.items():
+        values = fields[ratio.field]
+        fused = np.isfinite(values) & np.logical_or.accumulate(values > 0)
+        if fused.any() and (message, name) != (TILT, "tas"):
+            gate = log.gate(EKFS[message], ratio.gates)
+            ratios.append(GateRatios(name, t[fused], values[fused], gate, ratio.components))
     if not ratios:
         raise InputError(f"{path}: the test ratios of {message} are 0 throughout; nothing was fused")
     if sensor is not None:
         there = [each.sensor for each in ratios]
         ratios = [ratios[there.index(choose(path, "filter", there, sensor, "sensor"))]]
-    notes = [f"{path}: read as test ratios of {message}, {plural(len(rows), 'message')}"]
+    notes = [f"{path}: read as test ratios of {message}, {plural(len(t), 'message')}"]
     if bare := [each.sensor for each in ratios if np.isnan(each.gate)]:
         notes.append(f"{path}: PARM holds no gate of {listed(bare)}; what a right filter would exceed is not known")
     return ratios, notes
@@ -98,66 +124,81 @@ def read_stated(path: Path, sensor: str, core: int | None = None) -> NisLog:
 
     Source: ardupilot.org, "Onboard Message Log Messages" (XKFD, XKF0).
     """
-    message, innovations, variances, power = STATED[sensor]
-    parts = innovations.split()
-    found, _ = _loaded(path, {message: [*parts, *variances.split()]})
-    if not found[message]:
+    stated = STATED[sensor]
+    message = stated.message
+    parts = stated.innovations
+    log = _Log(path, [message])
+    if not log.rows[message]:
         raise InputError(f"--filter {sensor}: {path} holds no message {message}, which has its innovations")
-    rows = _of_core(path, found[message], core)
-    t = _times(path, message, rows)
-    own, of = ({part: np.array([row[name] for row in rows], float) for part, name in zip(parts, names, strict=True)}
-               for names in (parts, variances.split()))  # fmt: skip
-    if low := [(name, values) for name, values in of.items() if (values < 0).any()]:
-        at = int(np.argmax(low[0][1] < 0))
-        raise InputError(f"{path}: {message} at {t[at]:.10g} s: {low[0][1][at]:.4g} is below 0, beside {low[0][0]}")
-    nis, dof, held = nis_of(Pairs(t, own, {part: values**power for part, values in of.items()}, 0), parts)
-    note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {plural(len(rows), 'message')} {message}"
+    t, fields = log.messages(message, core, (*parts, *stated.variances))
+    as_logged = Pairs(t, fields, dict(zip(parts, map(fields.__getitem__, stated.variances), strict=True)))
+    as_logged.require_variances(path, message, " at {t}: {value} is below 0, beside {field}")
+    variances = {part: values**stated.power for part, values in as_logged.variance.items()}
+    nis, dof, held = Pairs(t, fields, variances).nis(parts)
+    note = f"{path}: {sensor}: {int((dof > 0).sum())} innovations in {plural(len(t), 'message')} {message}"
     if held:
         note += f"; {held} repeat the innovation before"
-    return NisLog(sensor, np.arange(1.0, len(nis) + 1), t, nis, dof, (note,))
+    return numbered_log(sensor, t, nis, dof, [note])
 
 
-def _loaded(path: Path, wanted: dict[str, list[str]]) -> tuple[dict[str, list[dict[str, float]]], dict[str, float]]:
-    """Rows of messages, with their time and instance, and the smallest value of each parameter that is a gate."""
-    try:
-        from pymavlink.DFReader import DFReader_binary
-    except ImportError:
-        raise MissingPackageError(
-            f"{path}: a log of ArduPilot needs {remedy('ardupilot', package='pymavlink')}"
-        ) from None
-    if not is_file(path):
-        raise InputError(f"{path}: no such file")
-    with reading(path), path.open("rb") as file:
-        if file.read(len(BEGIN)) != BEGIN:
-            raise InputError(f"{path}: is not a flight log of ArduPilot; one begins with the format of its messages")
-    rows: dict[str, list[dict[str, float]]] = {name: [] for name in wanted}
-    gates: dict[str, float] = {}
-    said = io.StringIO()  # it prints what it skips
-    with (
-        reading(path),
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(said),
-        DFReader_binary(str(path)) as log,
-    ):
-        while (message := log.recv_match(type=[*wanted, "PARM"])) is not None:
-            kind = message.get_type()
-            if kind in rows:
-                fields = {"TimeUS", "TimeMS", CORE, *wanted[kind]} & {*message.get_fieldnames()}
-                rows[kind].append({name: float(getattr(message, name)) for name in fields})
-            elif str(message.Name).endswith("_I_GATE"):
-                gates[message.Name] = min(float(message.Value), gates.get(message.Name, np.inf))
-    return rows, gates
+class _Log:
+    """Messages of some kinds, and the smallest value of each parameter that is a gate."""
+
+    def __init__(self, path: Path, kinds: Iterable[str]) -> None:
+        try:
+            from pymavlink.DFReader import DFReader_binary
+        except ImportError:
+            needed = remedy("ardupilot", package="pymavlink")
+            raise MissingPackageError(f"{path}: a log of ArduPilot needs {needed}") from None
+        if not is_file(path):
+            raise InputError(f"{path}: no such file")
+        with reading(path), path.open("rb") as file:
+            if file.read(len(BEGIN)) != BEGIN:
+                what = "is not a flight log of ArduPilot; one begins with the format of its messages"
+                raise InputError(f"{path}: {what}")
+        self.path = path
+        self.rows: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
+        self.gates: dict[str, float] = {}
+        said = io.StringIO()  # it prints what it skips
+        with (
+            reading(path),
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+            DFReader_binary(str(path)) as log,
+        ):
+            while (message := log.recv_match(type=[*self.rows, "PARM"])) is not None:
+                self._keep(message.get_type(), message.to_dict())
+
+    def _keep(self, kind: str, fields: dict[str, Any]) -> None:
+        if kind in self.rows:
+            self.rows[kind].append(fields)
+        elif str(fields["Name"]).endswith("_I_GATE"):
+            name = fields["Name"]
+            value = float(fields["Value"])
+            self.gates[name] = min(value, self.gates.get(name, np.inf))
+
+    def gate(self, prefix: str, names: Iterable[str]) -> float:
+        """The smallest of some gates, sigma; NaN where none is known."""
+        smallest = min(self.gates.get(f"{prefix}_{name}_I_GATE", np.inf) for name in names)
+        return max(LEAST, smallest / 100.0) if np.isfinite(smallest) else np.nan
+
+    def messages(self, kind: str, core: int | None, names: Iterable[str]) -> Messages:
+        """Fields of the messages of one instance of the EKF."""
+        by_core: dict[int, list[dict[str, Any]]] = {}
+        for row in self.rows[kind]:
+            by_core.setdefault(int(row.get(CORE, 0)), []).append(row)
+        rows = by_core[choose(self.path, "run", sorted(by_core), core, "core of the EKF")]
+        t = np.array(list(map(_time, rows)))
+        if not np.isfinite(t).all():
+            raise InputError(f"{self.path}: {kind} has no field TimeUS")
+        require_in_order(self.path, kind, t)
+        fields = {}
+        for name in names:
+            fields[name] = np.array([row.get(name, 0.0) for row in rows], float)
+        return Messages(t, fields)
 
 
-def _of_core(path: Path, rows: list[dict[str, float]], core: int | None) -> list[dict[str, float]]:
-    cores = sorted({int(row.get(CORE, 0)) for row in rows})
-    own = choose(path, "run", cores, core, "core of the EKF")
-    return [row for row in rows if int(row.get(CORE, 0)) == own]
-
-
-def _times(path: Path, message: str, rows: list[dict[str, float]]) -> Array:
-    t = np.array([row["TimeUS"] * MICRO if "TimeUS" in row else row.get("TimeMS", np.nan) * 1e-3 for row in rows])
-    if not np.isfinite(t).all():
-        raise InputError(f"{path}: {message} has no field TimeUS")
-    require_in_order(path, message, t)
-    return t
+def _time(row: dict[str, Any]) -> float:
+    if "TimeUS" in row:
+        return float(row["TimeUS"]) * MICRO
+    return float(row.get("TimeMS", np.nan)) * 1e-3

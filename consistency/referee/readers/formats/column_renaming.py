@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.named_columns import (
-    CLOCKS,
-    HALVES,
-    MOVING,
-    OWN,
-    POSITIONS,
-    QUATERNIONS,
-    UNITS,
-    clock_of,
-    plain_name,
-    require_units,
-    stem_of,
-    unit_in,
-)
+from consistency.referee.readers.formats import named_columns as known
+from consistency.referee.readers.formats.named_columns import clock_of, plain_name, plain_names, unit_in
 from consistency.referee.readers.places import listed
 
 Columns = Mapping[str, str]  # names of columns here, and those in a file
+FAMILIES = (known.POSITIONS, known.QUATERNIONS, *known.MOVING)
 
 
 def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[str]:
@@ -39,58 +28,66 @@ def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[
     """
     new: dict[int, str] = {}
     for name, old in (columns or {}).items():
-        places = _spelled(names, old)
+        places = _places(names, old)
         if not places:
-            raise InputError(
-                f"{where}: has no column '{old}', which is to be read as '{name}'; there are: {listed(names, 12)}"
-            )
-        require_units([names[place] for place in places], where)
+            what = f"has no column '{old}', which is to be read as '{name}'"
+            raise InputError(f"{where}: {what}; there are: {listed(names, 12)}")
         for place, rest in places.items():
+            known.require_units([names[place]], where)
             new[place] = _with_unit(name.replace("*", rest), names[place])
-    taken = [word for name in new.values() for word in _alike(name)]
-    hidden = [f"{name} not used" if _plays(name, taken) else name for name in names]
-    out = [new.get(place, hidden[place]) for place in range(len(names))]
-    if twice := [name for name in new.values() if out.count(name) > 1]:
-        raise InputError(f"{where}: two columns are named '{twice[0]}'")
+    taken = set(chain.from_iterable(map(_alike, new.values())))
+    out = []
+    for place, name in enumerate(names):
+        if place not in new and _plays(name, taken):
+            name = f"{name} not used"
+        out.append(new.get(place, name))
+    for name in new.values():
+        if out.count(name) > 1:
+            raise InputError(f"{where}: two columns are named '{name}'")
     return out
 
 
-def _spelled(names: Sequence[str], old: str) -> dict[int, str]:
+def _places(names: Sequence[str], old: str) -> dict[int, str]:
     """Places of the columns of a name, or of all that a ``*`` stands for, with what stands in its place."""
     if "*" not in old:
-        exact = [i for i, name in enumerate(names) if name == old]
-        alike = [i for i, name in enumerate(names) if plain_name(name) == plain_name(old)]
-        return dict.fromkeys((exact or alike)[:1], "")
+        if old in names:
+            return {names.index(old): ""}
+        plain = plain_names(names)
+        return {plain.index(plain_name(old)): ""} if plain_name(old) in plain else {}
     before, _, after = old.partition("*")
-    long = len(before) + len(after)
-    return {
-        i: name[len(before) : len(name) - len(after)]
-        for i, name in enumerate(names)
-        if name.startswith(before) and name.endswith(after) and len(name) > long
-    }
+    found = {}
+    for place, name in enumerate(names):
+        if name.startswith(before) and name.endswith(after) and len(name) > len(before + after):
+            found[place] = name[len(before) : len(name) - len(after)]
+    return found
 
 
 def _with_unit(name: str, old: str) -> str:
     """A name of a time with the unit that the file states, if it states none itself."""
-    if clock_of([name]) is None or unit_in(name) is not None:
-        return name
     unit = unit_in(old)
-    return f"{name}_{next(word for word, each in UNITS.items() if each == unit)}" if unit else name
+    if clock_of([name]) is None or unit_in(name) is not None or unit is None:
+        return name
+    words = {value: word for word, value in reversed(known.UNITS.items())}
+    return f"{name}_{words[unit]}"
 
 
 def _alike(name: str) -> list[str]:
     """All spellings of the part that a column plays."""
     if clock_of([name]) is not None:
-        return [*CLOCKS, *(half for pair in HALVES for half in pair)]
+        return [*known.CLOCKS, *chain.from_iterable(known.HALVES)]
     plain = plain_name(name)
-    words = [[each.format(part) for each in family] for family in (POSITIONS, QUATERNIONS, *MOVING) for part in "xyzw"]
-    return [plain, *(word for spelled in words if plain in spelled for word in spelled)]
+    words = [plain]
+    for family in FAMILIES:
+        for part in "xyzw":
+            same = [spelling.format(part) for spelling in family]
+            if plain in same:
+                words += same
+    return words
 
 
-def _plays(name: str, words: Sequence[str]) -> bool:
+def _plays(name: str, words: set[str]) -> bool:
     """Whether a column has one of some spellings: with a unit, in a longer name, or in an estimate's name."""
     plain = plain_name(name)
-    bare = re.sub(rf"_({'|'.join(UNITS)})$", "", plain)
-    stem = stem_of(name, OWN[1:]) or plain
-    inner = tuple(f"_{word}" for word in words if "_" in word)
-    return bool({plain, bare, stem} & {*words}) or plain.endswith(inner)
+    own = {plain, known.without_unit(plain), known.stem_of(name, known.OWN[1:]) or plain}
+    ends = tuple(f"_{word}" for word in words if "_" in word)
+    return bool(own & words) or plain.endswith(ends)

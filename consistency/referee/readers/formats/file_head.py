@@ -34,26 +34,28 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
     if row is None or not lines:
         return None
     number, line = lines[-1]
-    comment = line.lstrip().startswith("#")
-    if not comment and len([text for _, text in lines if not text.lstrip().startswith("#")]) > 1:
+    comment = _is_comment(line)
+    if not comment and sum(not _is_comment(text) for _, text in lines) > 1:
         return None
-    text, width = line, len(fields_of(row))
+    names = fields_of(line)
+    width = len(fields_of(row))
     if comment:
         text = line.strip().lstrip("#")
-    names = fields_of(text)
-    if len(names) != width and comment:
-        names = re.split(r"\s{2,}", text.strip())
+        names = fields_of(text)
+        if len(names) != width:
+            names = re.split(r"\s{2,}", text.strip())
     if len(names) != width:
         return None
-    return Head(renamed(names, columns, path), number, comment, not any(mark in line for mark in ",;\t"))
+    is_spaced = not any(mark in line for mark in ",;\t")
+    return Head(renamed(names, columns, path), number, comment, is_spaced)
 
 
 def begins_with_numbers(path: Path) -> bool:
     """Whether the first line that is not a comment is of numbers alone."""
     lines, row = _beginning(path)
-    return (
-        row is not None and all(map(_is_number, fields_of(row))) and all(text.lstrip()[0] == "#" for _, text in lines)
-    )
+    if row is None or not all(_is_comment(text) for _, text in lines):
+        return False
+    return all(map(_is_number, fields_of(row)))
 
 
 def beginning(path: Path) -> bytes:
@@ -72,10 +74,11 @@ def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
     text = beginning(path).decode("utf-8-sig", "ignore")
     lines: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
-        if line.strip() and _is_row(line):
+        if not line.strip():
+            continue
+        if _is_row(line):
             return lines, line
-        if line.strip():
-            lines.append((number, line))
+        lines.append((number, line))
     return lines, None
 
 
@@ -83,7 +86,11 @@ def _is_row(line: str) -> bool:
     """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
     fields = fields_of(line)
     numbers = sum(map(_is_number, fields))
-    return not line.lstrip().startswith("#") and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+    return not _is_comment(line) and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _is_number(text: str) -> bool:
@@ -97,7 +104,10 @@ def _is_number(text: str) -> bool:
 def fields_of(line: str) -> list[str]:
     """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
     separator = max(",;\t", key=line.count)
+    fields = line.split()
+    if separator in line:
+        fields = line.split(separator)
     if '"' in line and separator in line:
         with suppress(csv.Error):  # of a line with a null character
             return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-    return [field.strip().strip('"') for field in (line.split(separator) if separator in line else line.split())]
+    return [field.strip().strip('"') for field in fields]

@@ -24,12 +24,14 @@ PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
 
 def is_bag(path: Path) -> bool:
     """A file of ROS 1 or 2, a folder of ROS 2, or a folder that holds such."""
-    return is_one_bag(path) or (path.is_dir() and any(is_one_bag(part) for part in path.iterdir()))
+    return is_one_bag(path) or (path.is_dir() and any(map(is_one_bag, path.iterdir())))
 
 
 def is_one_bag(path: Path) -> bool:
     """A file of ROS 1 or 2, or a folder of ROS 2."""
-    return (path.suffix in BAGS and path.is_file()) or (path.is_dir() and (path / "metadata.yaml").is_file())
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix in BAGS and path.is_file()
 
 
 def is_drive(path: Path) -> bool:
@@ -67,8 +69,8 @@ def is_plane(path: Path, columns: Columns | None = None) -> bool:
 def trajectory_files(folder: Path, columns: Columns | None = None) -> list[Path]:
     """Files of a folder that may be trajectories, by name."""
     files = _files(folder)
-    named = [p for p in files if p.suffix.lower() in TRAJECTORIES]
-    return named or [p for p in files if is_spatial(p, columns) or is_solution(p)]
+    named = [path for path in files if path.suffix.lower() in TRAJECTORIES]
+    return named or [path for path in files if is_spatial(path, columns) or is_solution(path)]
 
 
 def table_files(folder: Path) -> list[Path]:
@@ -77,42 +79,47 @@ def table_files(folder: Path) -> list[Path]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
 
 
 def fitted_note(path: Path) -> str:
     """A note on files whose covariances were fitted to their own errors; "" of others."""
-    for at in (path, path.parent):
-        if at.name == CORRECTED and (at.parent / CORRECTION).is_file():
-            return (
-                f"{path}: its covariances are corrected by factors fitted to these runs, so that their verdict shows "
-                f"nothing; {at.parent / HELD_OUT} has each run by the factors of others"
-            )
+    for corrected in (path, path.parent):
+        folder = corrected.parent
+        if corrected.name == CORRECTED and (folder / CORRECTION).is_file():
+            what = "its covariances are corrected by factors fitted to these runs, so that their verdict shows nothing"
+            return f"{path}: {what}; {folder / HELD_OUT} has each run by the factors of others"
     return ""
 
 
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 ARRAYS = "errors=truth - estimates, covariances=P"
+LOG, PACKED = "flight logs are for 'consistency monitor'", "unpack it"
+TEXT = "rename text to .csv, or to .txt if its columns have no names"
+HDF5, LOADED = "h5py.File(name)[key][()] is an array of it", "load it"
+SHEET = "save the sheet as .csv"
 WAYS_IN = {
-    **dict.fromkeys((".ulg", ".bin"), "flight logs are for 'consistency monitor'"),
-    **dict.fromkeys((".gz", ".zip", ".7z", ".xz", ".bz2", ".zst"), "unpack it"),
-    **dict.fromkeys((".dat", ".log", ".out", ""), "rename text to .csv, or to .txt if its columns have no names"),
+    ".ulg": LOG, ".bin": LOG, ".gz": PACKED, ".zip": PACKED, ".7z": PACKED, ".xz": PACKED, ".bz2": PACKED,
+    ".zst": PACKED, ".dat": TEXT, ".log": TEXT, ".out": TEXT, "": TEXT, ".h5": HDF5, ".hdf5": HDF5, ".npy": LOADED,
+    ".pkl": LOADED, ".pickle": LOADED, ".xls": SHEET, ".xlsx": SHEET, ".ods": SHEET,
     ".json": "a file with an object a line is .jsonl",
-    **dict.fromkeys((".h5", ".hdf5"), "h5py.File(name)[key][()] is an array of it"),
-    **dict.fromkeys((".npy", ".pkl", ".pickle"), "load it"),
-    **dict.fromkeys((".xls", ".xlsx", ".ods"), "save the sheet as .csv"),
-}  # for files of unknown kinds, by suffix
-FOREIGN = (
-    (rb"(?m)^CCSDS_OEM_VERS", "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km"),
-    (rb"(?m)^(# )?(Raw|Fix),", "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data"),
-    (rb"(?m)^\$G[A-Z]{4},", "a log of NMEA, which has deviations in its GST sentences alone"),
-)  # fmt: skip
+}  # for files of unknown kinds, by suffix  # fmt: skip
+FOREIGN = {
+    rb"(?m)^CCSDS_OEM_VERS": "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km",
+    rb"(?m)^(# )?(Raw|Fix),": "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data",
+    rb"(?m)^\$G[A-Z]{4},": "a log of NMEA, which has deviations in its GST sentences alone",
+}
 
 
 def is_foreign(path: Path) -> str:
     """What a text file of another format is, and how it gets here; "" of all else."""
-    begin = beginning(path) if path.suffix.lower() not in (*ARCHIVES, *BAGS) else b""
-    return next((hint for pattern, hint in FOREIGN if re.search(pattern, begin)), "")
+    if path.suffix.lower() in (*ARCHIVES, *BAGS):
+        return ""
+    begin = beginning(path)
+    for pattern, hint in FOREIGN.items():
+        if re.search(pattern, begin):
+            return hint
+    return ""
 
 
 def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRAYS) -> InputError:

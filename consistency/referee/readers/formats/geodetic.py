@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.sheet import Lines, increasing
-from consistency.referee.readers.formats.text_blocks import blocks
-from consistency.referee.readers.places import cut_note
+from consistency.referee.readers.formats.number_lines import Lines, increasing
+from consistency.referee.readers.formats.text_blocks import LineParser, parsed
 from consistency.referee.types import Array
 
 A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)
@@ -28,16 +28,17 @@ LEAPS = (  # days from which GPS time is one second more ahead of UTC (IERS, Bul
 AHEAD = {"GPST": 0.0, "UTC": 0.0, "JST": 9 * 3600.0}  # s of the clocks of RTKLIB before UTC, leap seconds aside
 GEODETIC = ("latitude(deg)", "longitude(deg)", "height(m)")
 SEXAGESIMAL = ("latitude(d'\")", "longitude(d'\")", "height(m)")  # degrees, minutes and seconds apart
+ANGLES = SEXAGESIMAL[:2]
 CENTRED = ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)")
 BASELINE = ("e-baseline(m)", "n-baseline(m)", "u-baseline(m)")
 STATED = {
-    GEODETIC: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
-    SEXAGESIMAL: ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
-    CENTRED: ("sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"),
-    BASELINE: ("sde", "sdn", "sdu", "sden", "sdnu", "sdue"),
-}
+    GEODETIC: "sdn sde sdu sdne sdeu sdun",
+    SEXAGESIMAL: "sdn sde sdu sdne sdeu sdun",
+    CENTRED: "sdx sdy sdz sdxy sdyz sdzx",
+    BASELINE: "sde sdn sdu sden sdnu sdue",
+}  # deviations, and the roots of cross terms
 AXES = {"e": 0, "n": 1, "u": 2, "x": 0, "y": 1, "z": 2}
-QUALITY: dict[float, str] = {1: "fixed", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
+QUALITY = {1: "fixed", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 
 
 @dataclass(frozen=True)
@@ -51,21 +52,27 @@ class Fixes(Lines):
     geodetic: bool = True
     alone: bool = False  # deviations are stated without cross terms
 
+    @property
+    def covariances(self) -> Array:
+        """(N, 3, 3)."""
+        return self.values[:, 4:].reshape(-1, 3, 3)
+
     def local(self, origin: Array | None = None) -> tuple[Array, Array]:
         """Positions (N, 3) and covariances (N, 3, 3) in the plane that touches the ellipsoid in ``origin``."""
-        place, P = self.values[:, 1:4], self.values[:, 4:].reshape(-1, 3, 3)
+        place = self.values[:, 1:4]
         if not self.geodetic:
-            return place, P
-        start = self.values[0, 1:4] if origin is None else origin
+            return place, self.covariances
+        start = place[0] if origin is None else origin
         turn = axes_at(start)
         between = turn @ np.swapaxes(axes_at(place), -1, -2)
-        return (centred(place) - centred(start)) @ turn.T, between @ P @ np.swapaxes(between, -1, -2)
+        return (centred(place) - centred(start)) @ turn.T, _turned(between, self.covariances)
 
 
 def centred(place: Array) -> Array:
     """Latitude, longitude, degrees, and height, m, (..., 3), to x, y, z from the centre of the earth, m."""
     latitude, longitude, height = np.moveaxis(np.asarray(place, float), -1, 0)
-    phi, lam = np.deg2rad(latitude), np.deg2rad(longitude)
+    phi = np.deg2rad(latitude)
+    lam = np.deg2rad(longitude)
     N = A / np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
     out = [(N + height) * np.cos(phi) * np.cos(lam), (N + height) * np.cos(phi) * np.sin(lam)]
     return np.stack([*out, (N * (1.0 - E2) + height) * np.sin(phi)], axis=-1)
@@ -77,7 +84,8 @@ def geodetic(point: Array) -> Array:
     The latitude is the fixed point of tan phi = (z + e^2 N sin phi) / p, which each round brings e^2 nearer.
     """
     x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
-    p, phi = np.hypot(x, y), np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
+    p = np.hypot(x, y)
+    phi = np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
     for _ in range(8):
         phi = np.arctan2(z + E2 * A * np.sin(phi) / np.sqrt(1.0 - E2 * np.sin(phi) ** 2), p)
     height = p * np.cos(phi) + z * np.sin(phi) - A * np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
@@ -86,11 +94,18 @@ def geodetic(point: Array) -> Array:
 
 def axes_at(place: Array) -> Array:
     """Rows east, north, up (..., 3, 3) of a place, as directions from the centre of the earth."""
-    phi, lam = np.deg2rad(np.asarray(place, float)[..., 0]), np.deg2rad(np.asarray(place, float)[..., 1])
-    s, c = np.sin(phi), np.cos(phi)
-    sl, cl, zero = np.sin(lam), np.cos(lam), np.zeros_like(phi)
+    latitude, longitude, _ = np.moveaxis(np.deg2rad(np.asarray(place, float)), -1, 0)
+    s = np.sin(latitude)
+    c = np.cos(latitude)
+    sl = np.sin(longitude)
+    cl = np.cos(longitude)
+    zero = np.zeros_like(latitude)
     rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _turned(R: Array, P: Array) -> Array:
+    return np.asarray(R @ P @ np.swapaxes(R, -1, -2))
 
 
 def localised(own: Lines, true: Lines) -> tuple[Lines, Lines, str]:
@@ -98,19 +113,19 @@ def localised(own: Lines, true: Lines) -> tuple[Lines, Lines, str]:
 
     The plane touches the ellipsoid in the first place of the truth, or of the estimates where the truth has none.
     """
-    geodetic = [each for each in (true, own) if isinstance(each, Fixes) and each.geodetic]
-    if not geodetic:
-        return _plain(own, None), _plain(true, None), ""
-    origin = geodetic[0].values[0, 1:4]
+    fixes = [each for each in (true, own) if isinstance(each, Fixes) and each.geodetic]
+    if not fixes:
+        return own, true, ""
+    origin = fixes[0].values[0, 1:4]
     at = f"{origin[0]:.7f}, {origin[1]:.7f} degrees, {origin[2]:.2f} m"
-    note = f"{geodetic[0].path}: x is east, y north, z up from its first place, {at} above the ellipsoid"
-    if len(geodetic) == 1:
-        other = own if geodetic[0] is true else true
+    note = f"{fixes[0].path}: x is east, y north, z up from its first place, {at} above the ellipsoid"
+    if len(fixes) == 1:
+        other = own if fixes[0] is true else true
         note += f"; add --align posyaw-all where {other.path} is in another world, turned about z or of another height"
     return _plain(own, origin), _plain(true, origin), note
 
 
-def _plain(lines: Lines, origin: Array | None) -> Lines:
+def _plain(lines: Lines, origin: Array) -> Lines:
     if not isinstance(lines, Fixes):
         return lines
     place, P = lines.local(origin)
@@ -131,101 +146,101 @@ def read_solution(path: Path) -> Fixes:
     InputError
         The file has no header that names these columns, a row is broken, or times do not increase.
     """
-    names: list[str] = []
-    rows: list[list[str]] = []
-    numbers: list[int] = []
-    clock = cut = ""
-    for block in blocks(path):
-        for number, line in block.lines():
-            if line.startswith("%"):
-                words = line[1:].split()
-                clock, names = (words[0], words[1:]) if words and words[0] in AHEAD else (clock, names)
-                continue
-            if not names:
-                raise InputError(f"{path}, line {number}: stands under no header '%  GPST  latitude(deg) ...'")
-            row, width = line.replace(",", " ").split(), len(names) + 2 * (1 + sum(n in SEXAGESIMAL[:2] for n in names))
-            if rows and not block.ends and len(row) != width:
-                cut = cut_note(path, number)
-                break
-            if len(row) != width:
-                what = f"has {len(row)} fields; its header names a time of two and {width - 2} more"
-                raise InputError(f"{path}, line {number}: {what}")
-            rows.append(row)
-            numbers.append(number)
-    if not rows:
+    solution = _Solution(path)
+    found = parsed(solution)
+    if not found.parts:
         raise InputError(f"{path}: holds no solution")
+    names = ["t", *solution.names]
+    values = np.concatenate(found.parts)
+    columns = dict(zip(names, values.T, strict=True))
     kind = next((each for each in STATED if set(each) <= set(names)), None)
     if kind is None:
-        raise InputError(
-            f"{path}: holds none of {', '.join(GEODETIC)}; {', '.join(CENTRED)}; {', '.join(BASELINE)}; have RTKLIB "
-            "write it with out-solformat =llh, =xyz or =enu"
-        )
-    t = np.array([_time(path, number, row, clock) for number, row in zip(numbers, rows, strict=True)])
-    values = _numbers(path, numbers, [row[2:] for row in rows])
-    if kind is SEXAGESIMAL:
-        values, names = _in_degrees(path, numbers, values, names, rows)
-    place = values[:, [names.index(name) for name in kind]]
-    P = _covariance(path, names, values, STATED[kind])
+        known = "; ".join(map(", ".join, (GEODETIC, CENTRED, BASELINE)))
+        raise InputError(f"{path}: holds none of {known}; have RTKLIB write it with out-solformat =llh, =xyz or =enu")
+    t = columns["t"]
+    place = np.column_stack([columns[name] for name in kind])
+    P = _covariance(path, columns, STATED[kind].split())
     if kind is CENTRED:
         place = geodetic(place)
-        P = axes_at(place) @ P @ np.swapaxes(axes_at(place), 1, 2)
-    quality = Counter(int(each) for each in values[:, names.index("Q")]) if "Q" in names else Counter[int]()
-    shares = ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(quality.items()))
-    note = (
-        f"{path}: read as a solution of RTKLIB, {len(names) + 2} columns, {_clock_note(clock, t)}; {shares or 'no Q'}"
-    )
+        P = _turned(axes_at(place), P)
+    read_as = f"read as a solution of RTKLIB, {len(names) + 1} columns, {_clock_note(solution.clock, t)}"
+    note = f"{path}: {read_as}; {_qualities(columns)}"
     values = np.column_stack([t, place, P.reshape(-1, 9)])
-    lines = Fixes(path, values, np.array(numbers), note, cut=cut, geodetic=kind is not BASELINE)
+    lines = Fixes(path, values, found.line, note, cut=found.cut, geodetic=kind is not BASELINE)
     increasing(lines)
     return lines
 
 
-def _numbers(path: Path, numbers: Sequence[int], rows: Sequence[Sequence[str]]) -> Array:
-    out = []
-    for number, row in zip(numbers, rows, strict=True):
+class _Solution(LineParser):
+    """A solution while it is read: its clock, and the names of its columns but the time."""
+
+    clock = ""
+    names: Sequence[str] = ()
+
+    @property
+    def width(self) -> int:
+        """Fields of a row: the time has two, and an angle in degrees, minutes and seconds three."""
+        return 2 + len(self.names) + 2 * sum(map(ANGLES.count, self.names))
+
+    def is_whole(self, line: str, above: object) -> bool:
+        return line.startswith("%") or len(line.replace(",", " ").split()) == self.width
+
+    def part(self, rows: list[list[float]], numbers: list[int]) -> Array:
+        return np.array(rows)
+
+    def row(self, number: int, line: str) -> list[float] | None:
+        """The time, and numbers under the names of the header."""
+        where = f"{self.path}, line {number}"
+        fields = line.replace(",", " ").split()
+        if line.startswith("%"):
+            words = line[1:].split()
+            if words and words[0] in AHEAD:
+                self.clock = words[0]
+                self.names = words[1:]
+            return None
+        if not self.names:
+            raise InputError(f"{where}: stands under no header '%  GPST  latitude(deg) ...'")
+        if len(fields) != self.width:
+            what = f"its header names a time of two and {self.width - 2} more"
+            raise InputError(f"{where}: has {len(fields)} fields; {what}")
         try:
-            out.append([float(field) for field in row])
+            values = list(map(float, fields[2:]))
         except ValueError:
-            raise InputError(f"{path}, line {number}: a field is not a number ({' '.join(row)[:60]})") from None
-    return np.array(out)
+            raise InputError(f"{where}: a field is not a number ({' '.join(fields[2:])[:60]})") from None
+        row = [_time(where, fields[:2], self.clock)]
+        for name in self.names:
+            if name in ANGLES:
+                of = fields[-len(values) :][:3]
+                row.append(_degrees(f"{where}: '{' '.join(of)}'", *values[:3]))
+                values = values[3:]
+            else:
+                row.append(values.pop(0))
+        return row
 
 
-def _in_degrees(
-    path: Path, numbers: Sequence[int], values: Array, names: Sequence[str], rows: Sequence[Sequence[str]]
-) -> tuple[Array, list[str]]:
-    """Values with degrees, minutes and seconds in one column, and their names; -0 degrees are negative."""
-    columns, at = [], 0
-    for name in names:
-        if name not in SEXAGESIMAL[:2]:
-            columns.append(values[:, at])
-            at += 1
-            continue
-        whole, minutes, seconds = values[:, at : at + 3].T
-        bad = np.flatnonzero((minutes < 0) | (minutes >= 60) | (seconds < 0) | (seconds > 60) | (whole % 1 != 0))
-        if len(bad):
-            row = rows[bad[0]]
-            what = f"'{' '.join(row[2 + at : 5 + at])}' is not an angle of degrees, minutes and seconds"
-            raise InputError(f"{path}, line {numbers[bad[0]]}: {what}")
-        columns.append(np.copysign(np.abs(whole) + minutes / 60.0 + seconds / 3600.0, whole))
-        at += 3
-    return np.column_stack(columns), list(names)
+def _degrees(which: str, whole: float, minutes: float, seconds: float) -> float:
+    """Degrees of an angle; those of -0 degrees are negative."""
+    if not (0 <= minutes < 60 and 0 <= seconds <= 60 and whole % 1 == 0):
+        raise InputError(f"{which} is not an angle of degrees, minutes and seconds")
+    return math.copysign(abs(whole) + minutes / 60.0 + seconds / 3600.0, whole)
 
 
-def _time(path: Path, number: int, row: Sequence[str], clock: str) -> float:
+def _time(where: str, fields: Sequence[str], clock: str) -> float:
     """Seconds since 1970 in UTC of a date and a time of day, or of a week and its second."""
+    date, time = fields
     try:
-        if "/" in row[0]:
-            (year, month, day), (hour, minute, seconds) = map(int, row[0].split("/")), row[1].split(":")
-            second = float(seconds)
+        if "/" in date:
+            hour, minute, seconds = time.split(":")
+            year, month, day = map(int, date.split("/"))
             at = dt.datetime(year, month, day, int(hour), int(minute))
+            second = float(seconds)
         else:
-            at, second = GPS + dt.timedelta(weeks=int(row[0])), float(row[1])
-    except (ValueError, IndexError, TypeError, OverflowError):
-        raise InputError(
-            f"{path}, line {number}: '{' '.join(row[:2])}' is not a date and time, and no GPS week"
-        ) from None
-    whole = (at - UNIX).total_seconds() - AHEAD[clock]
-    return whole + second - (leap_seconds(whole + second) if clock == "GPST" else 0)
+            at = GPS + dt.timedelta(weeks=int(date))
+            second = float(time)
+    except (ValueError, OverflowError):
+        raise InputError(f"{where}: '{date} {time}' is not a date and time, and no GPS week") from None
+    t = (at - UNIX).total_seconds() - AHEAD[clock] + second
+    return t - leap_seconds(t) if clock == "GPST" else t
 
 
 def leap_seconds(t: float) -> int:
@@ -241,13 +256,22 @@ def _clock_note(clock: str, t: Array) -> str:
     return f"times of GPS as UTC, {first} leap seconds less"
 
 
-def _covariance(path: Path, names: Sequence[str], values: Array, stated: Sequence[str]) -> Array:
+def _qualities(columns: dict[str, Array]) -> str:
+    """How many rows are of which quality."""
+    if "Q" not in columns:
+        return "no Q"
+    counts = Counter(columns["Q"].astype(int).tolist())
+    return ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(counts.items()))
+
+
+def _covariance(path: Path, columns: dict[str, Array], stated: Sequence[str]) -> Array:
     """Covariances (N, 3, 3) of east, north, up, or of x, y, z, of deviations and signed roots of cross terms."""
-    P = np.zeros((len(values), 3, 3))
+    P = np.empty((len(next(iter(columns.values()))), 3, 3))
     for name in stated:
-        if f"{name}(m)" not in names:
+        if f"{name}(m)" not in columns:
             raise InputError(f"{path}: column '{name}(m)' is missing, of the deviations of the position")
-        root = values[:, names.index(f"{name}(m)")]
-        i, j = (AXES[letter] for letter in (name[2:] * 2)[:2])
+        root = columns[f"{name}(m)"]
+        i = AXES[name[2]]
+        j = AXES[name[-1]]
         P[:, i, j] = P[:, j, i] = root * np.abs(root)
     return P

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL
 from consistency.referee.geometry.groups import state_error
+from consistency.referee.readers.formats.rotations import are_rotations, quaternions
 from consistency.referee.types import Array
 
 AXES = {
@@ -22,7 +22,6 @@ AXES = {
 }  # parts of a state, in their order in the covariance where the key ``order`` names no other
 STATE = ("p", "R", "v", "bg", "ba")  # their order in a state
 TRUE = "true_"  # before the name of a part
-ROTATION = 1e-3  # largest entry of R R' - I
 
 
 def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | None) -> tuple[dict[str, Array], str]:
@@ -49,24 +48,26 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         )
     parts = [part for part in AXES if part in arrays]
     order = _order(path, arrays, parts)
-    own, true = ({part: _part(path, arrays, f"{prefix}{part}") for part in parts} for prefix in ("", TRUE))
+    own = {}
+    true = {}
     for part in parts:
+        own[part] = _part(path, arrays, part)
+        true[part] = _part(path, arrays, TRUE + part)
         if own[part].shape != true[part].shape or own[part].shape[:2] != own["R"].shape[:2]:
-            shapes = f"{own[part].shape} and {true[part].shape}"
-            beside = f"keys '{part}' and '{TRUE}{part}' have shapes {shapes}"
-            raise InputError(f"{path}: {beside}, beside R {own['R'].shape}")
+            shapes = f"{own[part].shape} and {true[part].shape}, beside R {own['R'].shape}"
+            raise InputError(f"{path}: keys '{part}' and '{TRUE}{part}' have shapes {shapes}")
         if not np.isfinite(true[part]).all():
             raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
-    own["R"], true["R"] = _quaternions(path, "R", own["R"]), _quaternions(path, f"{TRUE}R", true["R"])
-    states = [part for part in STATE if part in parts]
-    estimate, truth = (np.concatenate([side[part] for part in states], axis=-1) for side in (own, true))
+    states = list(STATE[: len(parts)])
+    estimate = _states(path, own, states, "")
+    truth = _states(path, true, states, TRUE)
     finite = np.isfinite(estimate).all(axis=-1)
     error = np.full((*finite.shape, 3 * len(states)), np.nan)
     error[finite] = state_error(truth[finite], estimate[finite], convention)
-    errors = dict(zip(states, np.split(error, len(states), axis=-1), strict=True))
+    places = [3 * states.index(part) + i for part in order for i in range(3)]
     rest = {key: array for key, array in arrays.items() if key.removeprefix(TRUE) not in (*AXES, "order")}
-    axes = [axis for part in order for axis in AXES[part]]
-    rest |= {"errors": np.concatenate([errors[part] for part in order], axis=-1), "axes": np.array(axes)}
+    rest["errors"] = error[..., places]
+    rest["axes"] = np.array([AXES[part] for part in order]).ravel()
     of = "and the difference of the velocity"
     if convention in ("left", "right"):
         of = "with the velocity, of SE2(3)"
@@ -74,32 +75,35 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
 
 
 def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:
-    if ("bg" in parts) != ("ba" in parts):
-        raise InputError(f"{path}: key '{'ba' if 'bg' in parts else 'bg'}' is missing; there are two biases or none")
-    if missing := [f"{TRUE}{part}" for part in parts if f"{TRUE}{part}" not in arrays]:
-        raise InputError(f"{path}: key '{missing[0]}' is missing, of the true states")
-    order = [str(part) for part in np.atleast_1d(arrays.get("order", np.array(parts)))]
+    """The parts as they stand in the covariance; refused where a part is missing."""
+    for bias, other in (("bg", "ba"), ("ba", "bg")):
+        if bias in parts and other not in parts:
+            raise InputError(f"{path}: key '{other}' is missing; there are two biases or none")
+    for part in parts:
+        if TRUE + part not in arrays:
+            raise InputError(f"{path}: key '{TRUE}{part}' is missing, of the true states")
+    order = list(map(str, np.atleast_1d(arrays.get("order", np.array(parts)))))
     if sorted(order) != sorted(parts):
         raise InputError(f"{path}: key 'order' is {', '.join(order)}; must name {', '.join(parts)}, each once")
     return order
 
 
 def _part(path: Path, arrays: Mapping[str, Array], key: str) -> Array:
+    """A part of all states, (runs, steps, 3) or (runs, steps, 3, 3)."""
     tail = (3, 3) if key.endswith("R") else (3,)
     array = np.asarray(arrays[key], float)
-    if array.shape[-len(tail) :] != tail or array.ndim not in (len(tail) + 1, len(tail) + 2):
-        wanted = ", ".join(map(str, ("runs", "steps", *tail)))
-        raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs ({wanted})")
-    return array if array.ndim == len(tail) + 2 else array[None]
+    lead = array.ndim - len(tail)
+    if array.shape[-len(tail) :] != tail or lead not in (1, 2):
+        wanted = ", ".join(map(str, tail))
+        raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs (runs, steps, {wanted})")
+    return array if lead == 2 else array[None]
 
 
-def _quaternions(path: Path, key: str, R: Array) -> Array:
-    """Quaternions (runs, steps, 4) of rotations; NaN where they are not finite."""
+def _states(path: Path, parts: Mapping[str, Array], order: list[str], prefix: str) -> Array:
+    """States (runs, steps, 4 + 3 k) with quaternions; NaN where a rotation is not finite."""
+    R = parts["R"]
     finite = np.isfinite(R).all(axis=(-2, -1))
-    off = np.abs(R[finite] @ np.swapaxes(R[finite], -1, -2) - np.eye(3)).max(axis=(-2, -1))
-    if (off > ROTATION).any() or (np.linalg.det(R[finite]) < 0).any():
-        raise InputError(f"{path}: key '{key}' holds a matrix that is not a rotation")
-    out = np.full((*R.shape[:2], 4), np.nan)
-    if finite.any():
-        out[finite] = Rotation.from_matrix(R[finite]).as_quat()
-    return out
+    if not are_rotations(R[finite]).all():
+        raise InputError(f"{path}: key '{prefix}R' holds a matrix that is not a rotation")
+    columns = {**parts, "R": quaternions(R)}
+    return np.concatenate(list(map(columns.__getitem__, order)), axis=-1)

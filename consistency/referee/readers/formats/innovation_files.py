@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import MOST_DOF, one_line, require_name
+from consistency.referee.parsing import MOST_DOF, require_name
+from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
-from consistency.referee.readers.formats.numpy_archive import load_arrays, run_lengths, step_times, whole_numbers
+from consistency.referee.readers.formats.number_lines import bounded
 from consistency.referee.readers.formats.other_names import with_clock
-from consistency.referee.readers.formats.sheet import TableRows, are_dof, bounded, read_sheet
+from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")
+DOF_NEEDED = "a whole number from 0 to below 2^31"
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,11 @@ class NisLog:
     nis: Array  # (N,), NaN where there is none
     dof: Array  # (N,), whole numbers of 0 or more
     notes: tuple[str, ...] = ()  # what a reader must know: what was left out
+
+
+def numbered_log(name: str, t: Array, nis: Array, dof: Array, notes: Iterable[str] = ()) -> NisLog:
+    """A log whose steps are numbered from 1."""
+    return NisLog(name, np.arange(1.0, len(nis) + 1), t, nis, dof, tuple(notes))
 
 
 def read_nis(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
@@ -56,23 +63,7 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
         if filter_name is not None:
             raise InputError(f"--filter {filter_name}: does not go with {path}")
         return _of_archive(path, run)
-    sheet = read_sheet(path)
-    _require_columns(str(path), list(sheet.data))
-    sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
-    key = next((column for column in ("step", "t") if column in sheet), None)
-    if key is not None:
-        sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
-    sheet = with_clock(sheet, required=False)
-    nis = sheet.numbers("nis")
-    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    name, step, t = path.stem, np.arange(1.0, len(nis) + 1), np.full(len(nis), np.nan)
-    if "filter" in sheet:
-        name = str(sheet.data["filter"][0])
-    if "step" in sheet:
-        step = sheet.numbers("step")
-    if "t" in sheet:
-        t = sheet.numbers("t")
-    return NisLog(name, step, t, nis, dof, tuple(filter(None, [sheet.cut])))
+    return _of_table(path, filter_name, run)
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -102,17 +93,39 @@ def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
     """
     dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
     bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
-    needed = "nis must be 0 or more and finite, nis_dof a whole number from 0 to below 2^31"
+    needed = f"nis must be 0 or more and finite, nis_dof {DOF_NEEDED}"
     refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
     return dof
 
 
-def _require_columns(place: str, columns: list[str]) -> None:
-    missing = [column for column in NEEDED if column not in columns]
-    if missing:
-        raise InputError(
-            f"{place}: '{missing[0]}' is missing; needed are nis and nis_dof, there are: {', '.join(columns[:12])}"
-        )
+def _require_columns(place: Path | str, columns: Sequence[str]) -> None:
+    for needed in NEEDED:
+        if needed not in columns:
+            there = ", ".join(columns[:12])
+            raise InputError(f"{place}: '{needed}' is missing; needed are nis and nis_dof, there are: {there}")
+
+
+def _of_table(path: Path, filter_name: str | None, run: int | None) -> NisLog:
+    sheet = read_sheet(path)
+    _require_columns(path, list(sheet.data))
+    sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
+    for key in ("step", "t"):
+        if key in sheet:
+            sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
+            break
+    sheet = with_clock(sheet, required=False)
+    nis = sheet.numbers("nis")
+    dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
+    name = path.stem
+    step = np.arange(1.0, len(nis) + 1)
+    t = np.full(len(nis), np.nan)
+    if "filter" in sheet:
+        name = str(sheet.data["filter"][0])
+    if "step" in sheet:
+        step = sheet.numbers("step")
+    if "t" in sheet:
+        t = sheet.numbers("t")
+    return NisLog(name, step, t, nis, dof, tuple(filter(None, [sheet.cut])))
 
 
 def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRows:
@@ -129,20 +142,20 @@ def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRow
 
 def _of_archive(path: Path, run: int | None) -> NisLog:
     arrays = _with_nis(path, load_arrays(path, "nis and nis_dof"))
-    _require_columns(str(path), list(arrays))
+    _require_columns(path, list(arrays))
+    archive = Archive(path, arrays)
     for key in NEEDED:
-        if arrays[key].dtype.kind not in "fiu":
-            raise InputError(f"{path}: key '{key}' holds {arrays[key].dtype}, not numbers")
+        archive.require_numbers(key)
     nis = np.atleast_2d(bounded(np.asarray(arrays["nis"], float)))
     if nis.ndim != 2 or not nis.size:
         raise InputError(f"{path}: key 'nis' has shape {nis.shape}, needs (steps,) or (runs, steps)")
-    dof = whole_numbers(path, arrays, "nis_dof", nis.shape)
+    dof = archive.whole_numbers("nis_dof", nis.shape)
     row = choose(path, "run", list(range(len(nis))), run)
-    steps = run_lengths(path, arrays, *nis.shape)[row]
-    t = step_times(path, arrays, nis.shape[1])[:steps]
+    steps = archive.lengths(*nis.shape)[row]
     own = nis[row, :steps]
+    t = archive.times(nis.shape[1])[:steps]
     dof = checked_dof(own, dof[row, :steps], lambda k: f"{path}, run {row}, step {k + 1}")
-    return NisLog(path.stem, np.arange(1.0, steps + 1), t, own, dof)
+    return numbered_log(path.stem, t, own, dof)
 
 
 def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
@@ -153,16 +166,18 @@ def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
     from consistency.referee.diagnostics.questions.innovations import nis_of
 
     v, S = (arrays[key] for key in keys)
-    if v.dtype.kind not in "fiu" or S.dtype.kind not in "fiu" or v.ndim < 2 or S.shape != (*v.shape, v.shape[-1]):
+    are_numbers = v.dtype.kind in "fiu" and S.dtype.kind in "fiu"
+    if not are_numbers or v.ndim < 2 or S.shape != (*v.shape, v.shape[-1]):
         raise InputError(
             f"{path}: keys 'innovations' {v.shape} and 'innovation_covariances' {S.shape} must be numbers of shape "
             "(steps, m) and (steps, m, m), with runs before them where there are several"
         )
-    known = np.isfinite(v).all(axis=-1)
     nis, dof = nis_of(np.asarray(v, float), np.asarray(S, float))
-    place = "runs and steps, from 0" if v.ndim > 2 else "step, from 0"
-    if bad := np.argwhere(known & np.isnan(nis)).tolist():
-        raise InputError(f"{path}: key 'innovation_covariances' is not positive definite at {bad[0]} ({place})")
+    indefinite = np.isfinite(v).all(axis=-1) & np.isnan(nis)
+    if indefinite.any():
+        place = "runs and steps, from 0" if v.ndim > 2 else "step, from 0"
+        at = np.argwhere(indefinite)[0].tolist()
+        raise InputError(f"{path}: key 'innovation_covariances' is not positive definite at {at} ({place})")
     return arrays | {"nis": nis, "nis_dof": dof}
 
 
@@ -174,35 +189,29 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
     InputError
         The header lacks a column, or a line cannot be used.
     """
-    columns: list[str] = []
-    separator = ","
+    table = CsvTable(Path(name))
     for number, line in enumerate(lines, 1):
         text = line.lstrip("\ufeff").strip()
         if not text or text.startswith("#"):
             continue
-        if not columns:
-            separator = max(",;\t", key=text.count)
-            columns = [column.strip().strip('"') for column in text.split(separator)]
-            _require_columns(name, columns)
-            several = [column for column in ("run", "filter") if column in columns]
-            if several:
-                raise InputError(f"{name}: column '{several[0]}': lines as they come must be of one run of one filter")
+        fields = table.row(number, text)
+        if fields is None:
+            _require_one_run(name, table.names)
             continue
-        fields = text.split(separator)
-        place = f"{name}, line {number}"
-        if len(fields) != len(columns):
-            raise InputError(f"{place}: has {len(fields)} columns, the header has {len(columns)}")
-        row = dict(zip(columns, fields, strict=True))
-        nis, dof = (_number(place, key, row[key].strip()) for key in NEEDED)
+        row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
+        nis = float(row.numbers("nis")[0])
+        dof = float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:
-            raise InputError(f"{place}: nis_dof must be a whole number from 0 to below 2^31, got {dof:g}")
-        yield place, nis, 0.0 if nis != nis and dof != dof else dof
-    if not columns:
+            raise InputError(f"{row.place(0)}: nis_dof must be {DOF_NEEDED}, got {dof:g}")
+        if np.isnan(nis) and np.isnan(dof):
+            dof = 0.0
+        yield row.place(0), nis, dof
+    if not table.names:
         raise InputError(f"{name}: is empty; its first line must name the columns, nis and nis_dof among them")
 
 
-def _number(place: str, column: str, text: str) -> float:
-    try:
-        return float(bounded(np.array(float(text) if text else np.nan)))
-    except ValueError:
-        raise InputError(f"{place}: column '{column}': not a number ({one_line(text, 60)})") from None
+def _require_one_run(name: str, columns: Sequence[str]) -> None:
+    _require_columns(name, columns)
+    for several in ("run", "filter"):
+        if several in columns:
+            raise InputError(f"{name}: column '{several}': lines as they come must be of one run of one filter")

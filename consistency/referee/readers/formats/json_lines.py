@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +12,28 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import keys_once, reading
-from consistency.referee.readers.formats.text_blocks import blocks
-from consistency.referee.readers.places import cut_note
-from consistency.referee.types import Array, Indices
+from consistency.referee.readers.formats.text_blocks import LineParser, Parsed, parsed
+from consistency.referee.types import Array
 
 GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
 
 
-def read_json_lines(path: Path) -> tuple[dict[str, Array], Indices, int, str]:
-    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the numbers of its lines.
+class _Objects(LineParser):
+    def row(self, number: int, line: str) -> dict[str, Any]:
+        return _row(self.path, number, line)
 
-    Also the last line if it has no end, or else 0, and a note if it is cut short and left out.
-    """
-    numbers: list[int] = []
-    rows: list[dict[str, Any]] = []
-    open_line, cut = 0, ""
-    for block in blocks(path):
-        for number, line in block.lines():
-            if rows and not block.ends and not line.rstrip().endswith("}"):
-                cut = cut_note(path, number)
-                break
-            rows.append(_row(path, number, line))
-            numbers.append(number)
-            open_line = 0 if block.ends else number
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: _column([row.get(name) for row in rows]) for name in names}
-    return columns, np.array(numbers), open_line, cut
+    def is_whole(self, line: str, above: object) -> bool:
+        return line.rstrip().endswith("}")
+
+
+def read_json_lines(path: Path) -> tuple[dict[str, Array], Parsed]:
+    """Columns of a file of JSON lines, with None or NaN where a line lacks a key, and the lines that they are of."""
+    found = parsed(_Objects(path))
+    rows = list(chain.from_iterable(found.parts))
+    columns = {}
+    for name in dict.fromkeys(chain.from_iterable(rows)):
+        columns[name] = _column([row.get(name) for row in rows])
+    return columns, found
 
 
 def _row(path: Path, number: int, line: str) -> dict[str, Any]:
@@ -52,16 +49,17 @@ def _row(path: Path, number: int, line: str) -> dict[str, Any]:
 
 
 def _cells(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if not isinstance(value, (dict, list)):
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
         yield name, value
         return
-    inner = value.items() if isinstance(value, dict) else enumerate(value)
-    for key, each in inner:
+    for key, each in value.items():
         yield from _cells(f"{name}.{key}".lstrip("."), each)
 
 
 def _column(cells: list[Any]) -> Array:
     """Floats where all cells are numbers or missing, else objects."""
-    if {type(cell) for cell in cells} <= {int, float, type(None)}:
-        return np.array([np.nan if cell is None else float(min(max(cell, -1e308), 1e308)) for cell in cells])
+    if set(map(type, cells)) <= {int, float, type(None)}:
+        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in cells], float)
     return np.array([*cells, None], object)[:-1]

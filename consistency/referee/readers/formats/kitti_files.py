@@ -14,18 +14,23 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_rows import on_plane
-from consistency.referee.readers.formats.sheet import Lines, TableRows
+from consistency.referee.readers.formats.rotations import are_rotations
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.types import Array
 
+EXAMPLE = "2011-09-26 13:02:25.594360375"
 STAMP = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{1,9})?")
 NANO = 1e-9  # s in a nanosecond
-ROTATION = 1e-3  # largest entry of R R' - I
 
 
 def place_of(drive: Path, name: str) -> Path | None:
     """A file in the folder of a drive or in that of its day, one above; None where it is in neither."""
-    return next((each / name for each in (drive, drive.absolute().parent) if (each / name).is_file()), None)
+    for folder in (drive, drive.absolute().parent):
+        if (folder / name).is_file():
+            return folder / name
+    return None
 
 
 def read_times(path: Path) -> Array:
@@ -38,10 +43,12 @@ def read_times(path: Path) -> Array:
     """
     stamps = []
     for number, line in enumerate(read_text(path, "cannot be read").rstrip().splitlines(), 1):
-        if not STAMP.fullmatch(line.strip()):
-            raise InputError(f"{path}, line {number}: not a timestamp; should be like 2011-09-26 13:02:25.594360375")
-        with reading(f"{path}, line {number}", "not a timestamp"):
-            stamps.append(np.datetime64(line.strip(), "ns").astype(np.int64))
+        where = f"{path}, line {number}"
+        stamp = line.strip()
+        if not STAMP.fullmatch(stamp):
+            raise InputError(f"{where}: not a timestamp; should be like {EXAMPLE}")
+        with reading(where, "not a timestamp"):
+            stamps.append(np.datetime64(stamp, "ns").astype(np.int64))
     if not stamps:
         raise InputError(f"{path}: is empty")
     back = np.flatnonzero(np.diff(stamps) <= 0)
@@ -61,26 +68,31 @@ def read_keys(path: Path, unnamed: str = "") -> dict[str, Array]:
         The file is missing, a key is duplicated, or a line is something else.
     """
     rows: dict[str, Array] = {}
-    for number, line in enumerate(line for line in read_text(path, "cannot be read").splitlines() if line.strip()):
+    lines = [line for line in read_text(path, "cannot be read").splitlines() if line.strip()]
+    for number, line in enumerate(lines):
         key, _, values = line.rpartition(":")
-        name = key.strip() or (f"{unnamed}{number}" if unnamed else "")
         if key.startswith("calib_time"):
             continue
+        name = key.strip()
+        where = f"line {number + 1}"
+        if key:
+            where = f"key '{one_line(name)}'"
+        if not name and unnamed:
+            name = f"{unnamed}{number}"
         if name in rows:
             raise InputError(f"{path}: key '{one_line(name)}' is duplicated")
         try:
             rows[name] = np.array(values.split(), float)
         except ValueError:
-            where = f"key '{one_line(name)}'" if key else f"line {number + 1}"
             raise InputError(f"{path}: {where}: must be numbers, after a key and a colon") from None
     return rows
 
 
 def numbers(path: Path, rows: dict[str, Array], name: str, shape: tuple[int, ...]) -> Array:
     """The numbers of a key, row by row in ``shape``; raises :class:`InputError`."""
-    count = int(np.prod(shape))
     if name not in rows:
         raise InputError(f"{path}: key '{name}' is missing; there: {one_line(', '.join(rows)) or 'nothing'}")
+    count = int(np.prod(shape))
     if rows[name].size != count or not (np.abs(rows[name]) < HUGE).all():
         raise InputError(f"{path}: key '{name}': must be {count} finite numbers")
     return rows[name].reshape(shape)
@@ -89,7 +101,7 @@ def numbers(path: Path, rows: dict[str, Array], name: str, shape: tuple[int, ...
 def turn(path: Path, rows: dict[str, Array], name: str) -> Array:
     """A rotation (3, 3) by its key."""
     R = numbers(path, rows, name, (3, 3))
-    if not np.abs(R @ R.T - np.eye(3)).max() < ROTATION or np.linalg.det(R) < 0:
+    if not are_rotations(R):
         raise InputError(f"{path}: key '{name}': is not a rotation")
     return R
 
@@ -130,10 +142,11 @@ def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
 
     Parameters and exceptions are those of :func:`read_drive`.
     """
-    stamps = read_times(folder / "oxts" / "timestamps.txt")
-    files = sorted((folder / "oxts" / "data").glob("*.txt"))
+    oxts = folder / "oxts"
+    stamps = read_times(oxts / "timestamps.txt")
+    files = sorted((oxts / "data").glob("*.txt"))
     if len(files) != len(stamps):
-        raise InputError(f"{folder / 'oxts'}: timestamps.txt has {len(stamps)} lines, but data {len(files)} packets")
+        raise InputError(f"{oxts}: timestamps.txt has {len(stamps)} lines, but data {len(files)} packets")
     packets = np.array([_packet(file) for file in files])
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]]).as_matrix()  # Rz(yaw) Ry(pitch) Rx(roll)
@@ -145,8 +158,7 @@ def drive_sheet(folder: Path, body: str | None = None) -> TableRows:
     """Poses of a drive in the plane: columns t, x, y, heading."""
     if body not in (None, *LEVEL):
         raise InputError(f"--body {body}: with x, y, heading it is {' or '.join(LEVEL)}, whose x and y are level")
-    lines = read_drive(folder, body)
-    return on_plane(lines, "packet")
+    return on_plane(read_drive(folder, body), "packet")
 
 
 def mercator(place: Array) -> Array:
@@ -178,7 +190,9 @@ def _mount(folder: Path, body: str) -> Array:
         path = place_of(folder, f"calib_{name}.txt")
         if path is None:
             raise InputError(f"{folder}: --body needs calib_{name}.txt, here or in the folder above")
-        rows, part = read_keys(path), np.eye(4)
-        part[:3, :3], part[:3, 3] = turn(path, rows, "R"), numbers(path, rows, "T", (3,))
+        rows = read_keys(path)
+        part = np.eye(4)
+        part[:3, :3] = turn(path, rows, "R")
+        part[:3, 3] = numbers(path, rows, "T", (3,))
         mount = part @ mount
     return mount

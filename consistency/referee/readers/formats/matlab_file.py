@@ -22,17 +22,27 @@ def load_matlab(path: Path) -> dict[str, Array]:
             raise InputError(f"{path}: is of MATLAB 7.3; write it with save(..., '-v7')")
     with reading(path):
         require_room(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)))
-        arrays = {key: np.asarray(value) for key, value in loadmat(path).items() if not key.startswith("__")}
-        for key in {"t", "dof", "lengths"} & {*arrays}:  # MATLAB has no fewer than two dimensions
-            arrays[key] = arrays[key].squeeze() if key == "dof" else arrays[key].ravel()
-        if "axes" in arrays:  # a cell of texts, or one text
-            arrays["axes"] = np.array([str(np.squeeze(each)) for each in arrays["axes"].ravel()])
-        if "mask" in arrays:
-            arrays["mask"] = arrays["mask"] != 0
+        arrays = {key: _array(key, value) for key, value in loadmat(path).items() if not key.startswith("__")}
     P = arrays.get("covariances")
     if P is None or P.ndim > 2:
         return arrays
     if P.shape[1] == 1:
         raise InputError(f"{path}: key 'covariances' has shape {P.shape}: one run of one component has (1, steps)")
-    keys = [key for key in ("errors", "estimates", "truth") if key in arrays]
-    return arrays | {key: arrays[key][..., None] for key in keys} | {"covariances": P[..., None, None]}
+    arrays["covariances"] = P[..., None, None]
+    for key in {"errors", "estimates", "truth"} & set(arrays):
+        arrays[key] = arrays[key][..., None]
+    return arrays
+
+
+def _array(key: str, value: object) -> Array:
+    """An array of a key; MATLAB has no fewer than two dimensions, no truth values, and texts in a cell."""
+    array = np.asarray(value)
+    if key in ("t", "lengths"):
+        return array.ravel()
+    if key == "dof":
+        return array.squeeze()
+    if key == "mask":
+        return np.asarray(array != 0)
+    if key == "axes":
+        return np.array([str(np.squeeze(each)) for each in array.ravel()])
+    return array

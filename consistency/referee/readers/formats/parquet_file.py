@@ -19,9 +19,10 @@ def open_parquet(path: Path, refusal: str = "cannot be read, damaged or cut shor
     with reading(path, refusal):
         file = pq.ParquetFile(path, page_checksum_verification=True)
         about = file.metadata
-        pages = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
+        groups = list(map(about.row_group, range(about.num_row_groups)))
+        pages = sum(group.total_byte_size for group in groups)
         require_room(path, max(pages, about.num_rows * about.num_columns * 8))
-        if about.num_rows != sum(about.row_group(k).num_rows for k in range(about.num_row_groups)):
+        if about.num_rows != sum(group.num_rows for group in groups):
             raise ValueError("its numbers of rows do not agree")  # no checksum is over them
     return file
 

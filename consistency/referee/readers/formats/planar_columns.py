@@ -15,9 +15,10 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.formats.named_columns import TRUE, clock_of, places_of
+from consistency.referee.readers.formats.number_lines import increasing
 from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
-from consistency.referee.readers.formats.sheet import TableRows, increasing
+from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
 from consistency.referee.types import Array
 
@@ -42,27 +43,31 @@ def read_plane(path: Path, motions: bool = False, columns: Columns | None = None
     clock = None if head is None else clock_of(head.names)
     if head is None or clock is None:
         raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
-    places, rates = places_of(head.names, PLACES), False
-    if places is None:
-        places, rates = places_of(head.names, (SPEEDS, TURNS)), True
-    if places is None:
-        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(head.names[:12])}")
-    others = covariance_places(head.names, POSE) | state_places(head.names, POSE, TRUE)
-    known = (*COVARIANCE, *LOWER_NAMES.values(), *(head.names[place] for place in others.values()))
-    stated = [name for name in dict.fromkeys(known) if name in head.names]
-    wanted = (*clock[0], *places, *(head.names.index(name) for name in stated))
-    lines, values = read_named(path, head, wanted, columns)
-    first = len(clock[0])
-    t, unit = times_of(lines, clock[0], values[:first], clock[1])
-    pose = np.column_stack(values[first : first + len(places)])
+    names = head.names
+    times, stated_unit = clock
+    poses = places_of(names, PLACES)
+    rates = places_of(names, (SPEEDS, TURNS))
+    moving = poses or rates
+    if moving is None:
+        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(names[:12])}")
+    kept = [name for name in (*COVARIANCE, *LOWER_NAMES.values()) if name in names]
+    for place in (covariance_places(names, POSE) | state_places(names, POSE, TRUE)).values():
+        kept.append(names[place])
+    kept = list(dict.fromkeys(kept))
+    lines, values = read_named(path, head, (*times, *moving, *map(names.index, kept)), columns)
+    t, unit = times_of(lines, times, values[: len(times)], stated_unit)
+    values = values[len(times) :]
+    pose = np.column_stack(values[: len(moving)])
     of = "planar poses"
-    if rates:
-        of = f"speed and turn rate, each held until the next, integrated to {'motions' if motions else 'poses'}"
-        pose = motions_of(t, pose[:, 0], pose[:, 1])
-        pose = pose if motions else poses_of(pose)
-    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[first + len(places) :]])))
-    note = f"{path}: read as {of}, {len(head.names)} columns, {UNIT_NAMES[unit]}"
-    data = dict(zip(["t", *POSE, *stated], rows.values.T, strict=True))
+    if poses is None:
+        what = "motions" if motions else "poses"
+        of = f"speed and turn rate, each held until the next, integrated to {what}"
+        pose = motions_of(t, *pose.T)
+        if not motions:
+            pose = poses_of(pose)
+    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[len(moving) :]])))
+    data = dict(zip(["t", *POSE, *kept], rows.values.T, strict=True))
+    note = f"{path}: read as {of}, {len(names)} columns, {UNIT_NAMES[unit]}"
     return TableRows(path, data, rows.line, "line", rows.open_line, rows.cut), note
 
 
@@ -73,7 +78,8 @@ def motions_of(t: Array, v: Array, omega: Array) -> Array:
     row is 0.
     """
     dt = np.diff(t)
-    turn, way = omega[:-1] * dt, v[:-1] * dt
+    turn = omega[:-1] * dt
+    way = v[:-1] * dt
     half = 0.5 * turn
     chord = way * np.sinc(half / np.pi)
     rows = np.column_stack([chord * np.cos(half), chord * np.sin(half), turn])
@@ -82,8 +88,10 @@ def motions_of(t: Array, v: Array, omega: Array) -> Array:
 
 def poses_of(motions: Array) -> Array:
     """Poses (N, 3) from (0, 0, 0) on, of motions as :func:`motions_of` gives them; headings within half a turn."""
-    heading = np.cumsum(motions[:, 2])
+    forward, left, turn = motions.T
+    heading = np.cumsum(turn)
     before = np.concatenate([[0.0], heading[:-1]])
-    c, s = np.cos(before), np.sin(before)
-    steps = np.column_stack([c * motions[:, 0] - s * motions[:, 1], s * motions[:, 0] + c * motions[:, 1]])
+    c = np.cos(before)
+    s = np.sin(before)
+    steps = np.column_stack([c * forward - s * left, s * forward + c * left])
     return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])

@@ -27,14 +27,9 @@ from consistency.referee.readers.formats.named_columns import (
     roles_of,
     true_roles_of,
 )
-from consistency.referee.readers.formats.sheet import (
-    Lines,
-    TableRows,
-    increasing,
-    read_numbers,
-    read_rows,
-    read_sheet,
-)
+from consistency.referee.readers.formats.number_lines import Lines, increasing, read_numbers, read_rows
+from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
+from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.text_blocks import blocks
 from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
@@ -46,10 +41,11 @@ DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
 DEVIATED = POSE + 6  # columns of a pose and six standard deviations
 TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
 ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
-MATRICES = {12: (), 13: (0,), 16: (), 17: (0,)}  # numbers of a matrix, 3 x 4 or 4 x 4, behind its time or number
+MATRICES = {12: 0, 13: 1, 16: 0, 17: 1}  # by columns of a matrix, 3 x 4 or 4 x 4, and of its time or number: the latter
 STATED = (0, TRIANGLE, FULL)  # columns of a covariance behind a matrix
-ROTATION = 1e-3  # largest entry of R R' - I
+MATRIX_WIDTHS = {matrix + stated: (first, matrix) for matrix, first in MATRICES.items() for stated in STATED}
 LAYOUT = f"t tx ty tz qx qy qz qw ({', '.join(map(str, TUM))} columns)"
+AS_ESTIMATED = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
 
 
 def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
@@ -68,50 +64,22 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
         return read_solution(path)
     head = head_of(path, columns)
     roles = None if head is None else roles_of(head.names, path)
-    if head is not None and roles is not None and not (head.comment and roles.is_tum and len(head.names) in TUM):
-        if not (roles.quaternion or true):
-            raise InputError(
-                f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}"
-            )
-        return _named(path, head, roles, true, columns)
-    widths = [matrix + stated for matrix in MATRICES for stated in STATED]
-    unnamed = (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES)
-    if head is not None and not head.comment and len(head.names) not in unnamed:
-        missing = "t" if clock_of(head.names) is None else "x"
-        names = ", ".join(head.names)
-        raise InputError(f"{path}: column '{missing}' is missing; there are: {names}; {naming(missing)}")
-    lines = read_rows(path, unnamed, LAYOUT)
-    width = lines.values.shape[1]
-    if width == POINT:
-        return increasing(replace(lines, note=f"{path}: read as positions without orientations, {width} columns"))
-    if width == DEVIATED:
-        of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
-        return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
-    if width in TUM:
-        note = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
-        return increasing(replace(lines, note=note if path.suffix.lower() == ".csv" else ""))
-    if width == ASL and not _is_rigid(lines.values[:, 1:]).all():
-        return _asl(lines, true)
-    if width in widths and (_is_rigid(_matrix(lines)[0]).all() or width not in STATES):
-        return _matrices(lines)
-    states = as_states(increasing(lines))
-    if states is None:
-        raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
-    return states
+    if head is None or roles is None or (head.comment and roles.is_tum and len(head.names) in TUM):
+        return _unnamed(path, true, head)
+    if not (roles.quaternion or true):
+        raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}")
+    return _named(path, head, roles, true, columns)
 
 
 def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
     head = head_of(path, columns)
-    if head is None:
-        return None
-    roles = true_roles_of(head.names, path)
-    if roles is None or not roles.quaternion:
+    roles = None if head is None else true_roles_of(head.names, path)
+    if head is None or roles is None or not roles.quaternion:
         return None
     lines = _named(path, head, roles, True, columns)
-    known = np.isfinite(lines.values).all(axis=1)
-    note = f"{path}: the truth stands in columns beside the estimates"
-    return replace(lines, values=lines.values[known], line=lines.line[known], rest=None, note=note)
+    finite = np.asarray(np.isfinite(lines.values).all(axis=1))
+    return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
 
 def on_plane(lines: Lines, unit: str) -> TableRows:
@@ -128,65 +96,63 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
             "a heading or a quaternion, or judge positions alone: --state x,y with a truth table of columns t, x, y"
         )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
-    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": np.arctan2(*ahead.T[1::-1])}
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": heading}
     return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
+
+
+# --- columns with names ------------------------------------------------------------------------------
 
 
 def _named(path: Path, head: Head, roles: Roles, true: bool, columns: Columns | None) -> Lines:
     """Rows under the names of their columns."""
-    pose = (*roles.time, *roles.position, *roles.quaternion, *roles.covariance)
-    lines, values = read_named(path, head, (*pose, *roles.rest), columns)
-    t, unit = times_of(lines, roles.time, values[: len(roles.time)], roles.unit)
+    pose = (*roles.position, *roles.quaternion)
+    lines, values = read_named(path, head, (*roles.time, *pose, *roles.covariance, *roles.rest), columns)
+    parts = np.cumsum([len(roles.time), len(pose), len(roles.covariance)])
+    times, own, stated, rest = (values[start:end] for start, end in zip([0, *parts], [*parts, None], strict=True))
+    t, unit = times_of(lines, roles.time, times, roles.unit)
     if roles.squared:
-        first = len(roles.time) + len(roles.position) + len(roles.quaternion)
-        values[first : len(pose)] = [np.sign(each) * np.sqrt(np.abs(each)) for each in values[first : len(pose)]]
-    of, clock = roles.kind, UNIT_NAMES[unit]
+        stated = [np.sign(each) * np.sqrt(np.abs(each)) for each in stated]
+    rows = np.column_stack([t, *own, *stated])
+    note = _named_note(path, head, roles, true, UNIT_NAMES[unit])
+    return increasing(replace(lines, values=rows, note=note, rest=np.column_stack(rest) if rest else None))
+
+
+def _named_note(path: Path, head: Head, roles: Roles, true: bool, clock: str) -> str:
+    of = roles.kind
+    order = "no orientation"
     if not true:
         of = of.replace(" truth", " poses")
     if len(roles.time) == 2:
         clock = "seconds and nanoseconds"
-    order = "no orientation"
     if roles.quaternion:
-        order = "quaternion w last"
-        if roles.quaternion[3] < roles.quaternion[0]:
-            order = "quaternion w first"
+        order = "quaternion w first" if roles.quaternion[3] < roles.quaternion[0] else "quaternion w last"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
-    if roles.covariance:
-        stated = "covariance"
-        if roles.squared:
-            stated = "variances"
-        elif len(roles.covariance) in DEVIATIONS:
-            stated = "standard deviations"
-        note += f", {stated} in {len(roles.covariance)} columns"
-    rest = np.column_stack(values[len(pose) :]) if roles.rest else None
-    rows = np.column_stack([t, *values[len(roles.time) : len(pose)]])
-    return increasing(replace(lines, values=rows, note=note, rest=rest))
+    if not roles.covariance:
+        return note
+    stated = "covariance"
+    if roles.squared:
+        stated = "variances"
+    elif len(roles.covariance) in DEVIATIONS:
+        stated = "standard deviations"
+    return f"{note}, {stated} in {len(roles.covariance)} columns"
 
 
 def read_named(
     path: Path, head: Head, places: Sequence[int], columns: Columns | None = None
 ) -> tuple[Lines, list[Array]]:
     """Some columns of a file with names, and lines that hold none of them yet."""
-    require_units([head.names[i] for i in places], path)
+    require_units([head.names[place] for place in places], path)
     if head.comment or head.spaced:
-        layout = f"{len(head.names)} columns as named"
-        lines = read_rows(path, [len(head.names)], layout, 0 if head.comment else head.line)
-        return replace(lines, values=lines.values[:, :0]), [lines.values[:, i] for i in places]
+        header = 0 if head.comment else head.line
+        lines = read_rows(path, [len(head.names)], f"{len(head.names)} columns as named", header)
+        return replace(lines, values=lines.values[:, :0]), [lines.values[:, place] for place in places]
     sheet = read_sheet(path, columns)
-    names = list(sheet.data)
-    if "run" in names or "filter" in names:
+    if "run" in sheet or "filter" in sheet:
         raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
     lines = Lines(path, np.empty((len(sheet), 0)), sheet.line, open_line=sheet.open_line, cut=sheet.cut)
-    return lines, [sheet.numbers(names[i]) for i in places]
-
-
-def _asl(lines: Lines, true: bool) -> Lines:
-    """The 17 columns of EuRoC without their names."""
-    t, unit = times_of(lines, (0,), [lines.t])
-    of = f"EuRoC {'truth' if true else 'poses'}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
-    note = f"{lines.path}: read as {of}"
-    values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
-    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
+    names = list(sheet.data)
+    return lines, [sheet.numbers(names[place]) for place in places]
 
 
 def times_of(
@@ -199,62 +165,90 @@ def times_of(
     unit = 10**9 if len(places) == 2 else unit_of(columns[0], unit)
     if unit < 10**9:
         return columns[0] / unit, unit
-    rows = iter(lines.line)
-    row, t = next(rows, None), []
-    for block in blocks(lines.path):
-        for number, line in block.lines():
-            if number == row:
-                cells = fields_of(line)
-                try:
-                    t.append(
-                        sum(int(cells[i]) * each for i, each in zip(places, (unit, 1)[-len(places) :], strict=True))
-                        / unit
-                    )
-                except (ValueError, IndexError, OverflowError):
-                    return (columns[0] / unit if len(places) == 1 else columns[0] + columns[1] / unit), unit
-                row = next(rows, None)
+    rows = iter(lines.line.tolist())
+    row = next(rows, None)
+    t = []
+    try:
+        for block in blocks(lines.path):
+            for number, line in block.lines():
+                if number == row:
+                    cells = fields_of(line)
+                    *seconds, nanoseconds = (int(cells[place]) for place in places)
+                    t.append((sum(seconds) * unit + nanoseconds) / unit)
+                    row = next(rows, None)
+    except (ValueError, IndexError, OverflowError):
+        if len(places) == 1:
+            return columns[0] / unit, unit
+        return columns[0] + columns[1] / unit, unit
     return np.array(t), unit
 
 
-# --- matrices ----------------------------------------------------------------------------------------
+# --- columns without names ---------------------------------------------------------------------------
+
+
+def _unnamed(path: Path, true: bool, head: Head | None) -> Lines:
+    """Rows of a layout that is told by the number of columns, and by what they hold."""
+    widths = [*TUM, DEVIATED, *MATRIX_WIDTHS, *STATES]
+    if true:
+        widths.append(POINT)
+    if head is not None and not head.comment and len(head.names) not in widths:
+        missing = "t" if clock_of(head.names) is None else "x"
+        names = ", ".join(head.names)
+        raise InputError(f"{path}: column '{missing}' is missing; there are: {names}; {naming(missing)}")
+    lines = read_rows(path, widths, LAYOUT)
+    width = lines.values.shape[1]
+    if width == POINT:
+        return increasing(replace(lines, note=f"{path}: read as positions without orientations, {width} columns"))
+    if width == DEVIATED:
+        return increasing(replace(lines, note=f"{path}: read as {AS_ESTIMATED}, {width} columns"))
+    if width in TUM:
+        note = ""
+        if path.suffix.lower() == ".csv":
+            note = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
+        return increasing(replace(lines, note=note))
+    if width == ASL and not _are_rigid(lines.values[:, 1:]).all():
+        return _asl(lines, true)
+    if width in MATRIX_WIDTHS and (width not in STATES or _are_rigid(_matrix(lines)[1]).all()):
+        return _matrices(lines)
+    states = as_states(increasing(lines))
+    if states is None:
+        raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
+    return states
+
+
+def _asl(lines: Lines, true: bool) -> Lines:
+    """The 17 columns of EuRoC without their names."""
+    t, unit = times_of(lines, (0,), [lines.t])
+    of = "truth" if true else "poses"
+    note = f"{lines.path}: read as EuRoC {of}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
+    values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
+    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
 
 
 def _matrix(lines: Lines) -> tuple[Array, Array, Array]:
-    """Numbers of the matrices (N, 12 or 16), what stands before them, and their covariances."""
-    width = lines.values.shape[1]
-    for stated in STATED:
-        if width - stated in MATRICES:
-            start, end = len(MATRICES[width - stated]), width - stated
-            return lines.values[:, start:end], lines.values[:, :start], lines.values[:, end:]
-    raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
+    """What stands before the matrices, their numbers (N, 12 or 16), and covariances."""
+    first, end = MATRIX_WIDTHS[lines.values.shape[1]]
+    return lines.values[:, :first], lines.values[:, first:end], lines.values[:, end:]
 
 
-def _is_rigid(numbers: Array) -> Indices:
+def _are_rigid(numbers: Array) -> Indices:
     """Whether rows (N, 12) or (N, 16) are the matrix of a rotation and a translation, or not finite."""
     M = numbers.reshape(len(numbers), -1, 4)
-    R, finite = M[:, :3, :3], np.asarray(np.isfinite(numbers).all(axis=1))
-    with np.errstate(invalid="ignore", over="ignore"):
-        right: Indices = (np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max((1, 2)) < ROTATION) & (
-            np.linalg.det(np.where(finite[:, None, None], R, 0.0)) > 0
-        )
+    right = are_rotations(M[:, :3, :3])
     if M.shape[1] == 4:
-        right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ROTATION
-    return np.asarray(right | ~finite)
+        right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < TOLERANCE
+    return np.asarray(right | ~np.isfinite(numbers).all(axis=1))
 
 
 def _matrices(lines: Lines) -> Lines:
     """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
-    numbers, before, covariance = _matrix(lines)
-    what = (
-        f"the {numbers.shape[1]} numbers are not a rotation and translation, row by row; should be these, or {LAYOUT}"
-    )
-    refuse(~_is_rigid(numbers), lines.place, what)
+    before, numbers, covariance = _matrix(lines)
+    what = f"the {numbers.shape[1]} numbers are not a rotation and translation, row by row"
+    refuse(~_are_rigid(numbers), lines.place, f"{what}; should be these, or {LAYOUT}")
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)
-    quaternion = np.full((len(M), 4), np.nan)
-    finite = np.isfinite(numbers).all(axis=1)
-    if finite.any():
-        quaternion[finite] = Rotation.from_matrix(M[finite, :3, :3]).as_quat()
+    quaternion = quaternions(M[:, :3, :3])
+    quaternion[~np.isfinite(numbers).all(axis=1)] = np.nan
     note = f"{lines.path}: read as matrices of {M.shape[1]} x 4, {lines.values.shape[1]} columns, {clock}"
     return increasing(replace(lines, values=np.column_stack([t, M[:, :3, 3], quaternion, covariance]), note=note))
 
@@ -267,23 +261,24 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
             return t, "the first one the number of the step"
         return t, f"the first one the time in {UNIT_NAMES[unit]}"
     times = lines.path.parent / "times.txt"
+    count = len(lines.line)
     if not times.is_file():
-        return np.arange(float(len(lines.line))), "numbered from 0 on, as there is no times.txt beside them"
+        return np.arange(float(count)), "numbered from 0 on, as there is no times.txt beside them"
     t = read_rows(times, (1,), "a time").t
-    if len(t) != len(lines.line):
-        raise InputError(f"{times}: has {len(t)} times, but {lines.path} {len(lines.line)} poses")
+    if len(t) != count:
+        raise InputError(f"{times}: has {len(t)} times, but {lines.path} {count} poses")
     return t, f"times from {times.name} beside them"
 
+
+# --- states of a simulation with OpenVINS ------------------------------------------------------------
 
 CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
 LARGEST = 200  # columns, of more cameras than OpenVINS takes
 STATES = range(CAMERAS + 1 + CALIBRATION, LARGEST)  # columns of a state
-DEVIATION_WIDTHS = range(
-    CAMERAS + CALIBRATION - 1, LARGEST
-)  # of its deviations: three for a rotation, in place of four
+DEVIATION_WIDTHS = range(CAMERAS + CALIBRATION - 1, LARGEST)  # of its deviations: a rotation has three, not four
 AS_TUM = [0, 5, 6, 7, 1, 2, 3, 4]  # t, position and quaternion in the order of TUM
 REST = slice(8, 17)  # velocity, biases
-SIGMA = slice(1, 16)  # rotation, position, velocity, biases
+SIGMA = [4, 5, 6, 1, 2, 3, *range(7, 16)]  # position, rotation, velocity, biases
 DEVIATIONS_LAYOUT = (
     "t, three standard deviations of the rotation, rad, three of the position, m, and those of the rest of the state"
 )
@@ -318,7 +313,7 @@ def read_deviations(path: Path) -> tuple[Lines, Array]:
         raise InputError(f"{lines.place(0)}: has {lines.values.shape[1]} columns; should be {DEVIATIONS_LAYOUT}")
     sigma = lines.values[:, SIGMA]
     refuse((sigma < 0).any(axis=1), lines.place, f"a standard deviation is below 0; should be {DEVIATIONS_LAYOUT}")
-    return lines, diagonal(np.concatenate([sigma[:, 3:6], sigma[:, :3], sigma[:, 6:]], axis=1))
+    return lines, diagonal(sigma)
 
 
 def _has_cameras(values: Array, column: int, each: int) -> bool:

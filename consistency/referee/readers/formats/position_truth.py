@@ -10,9 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
+from consistency.referee.geometry.groups import propagated
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.sheet import Lines
+from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
@@ -33,18 +34,16 @@ def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
     InputError
         Some runs have a truth with orientations, or an option needs one.
     """
-    truth = poses[0].files[1]
+    alone = f"{poses[0].files[1]} holds positions alone"
     if any(one.manifold != "vector" for one in poses):
         raise InputError(f"{path}: the truth of some runs has orientations, of others none; judge them apart")
-    if r.relative is not None or r.align not in (None, "posyaw", "posyaw-all"):
-        option = f"--align {r.align}"
-        if r.relative is not None:
-            option = "--relative"
-        raise InputError(f"{option}: needs a truth with orientations; {truth} holds positions alone")
-    if rotations := [axis for axis in r.axes or () if axis not in AXES[:3]]:
-        raise InputError(
-            f"--axes {','.join(r.axes or ())}: '{rotations[0]}' has no truth; {truth} holds positions alone"
-        )
+    if r.relative is not None:
+        raise InputError(f"--relative: needs a truth with orientations; {alone}")
+    if r.align not in (None, "posyaw", "posyaw-all"):
+        raise InputError(f"--align {r.align}: needs a truth with orientations; {alone}")
+    for axis in r.axes or ():
+        if axis not in AXES[:3]:
+            raise InputError(f"--axes {','.join(r.axes or ())}: '{axis}' has no truth; {alone}")
 
 
 def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
@@ -55,13 +54,13 @@ def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
     return f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
 
 
-def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
+def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Poses:
     """Estimated positions p + R l of a point of the body beside its true ones, with their covariances to first order.
 
     Parameters
     ----------
     poses : estimates in space; their truth (M, 3 or more) begins with the position
-    lever : (3,), m, from the origin of the body to the point, in the axes of the body
+    lever : (3,), m, from the origin of the body to the point, in the axes of the body; None for the origin
     blocks : position and rotation are stated apart, or as deviations, so that their cross-covariance is not known
 
     Raises
@@ -69,26 +68,22 @@ def positions(poses: Poses, lever: Sequence[float], blocks: bool) -> Poses:
     InputError
         The covariance of the point depends on cross terms that are not stated.
     """
-    arm = np.asarray(lever, float)
+    arm = np.zeros(3) if lever is None else np.asarray(lever, float)
     if blocks and (arm.any() or poses.convention == "right"):
-        of = "--error right"
-        if arm.any():
-            of = "--lever-arm"
-        raise InputError(
-            f"{poses.place[0]}: {of} moves errors of the rotation into that of the position, whose cross terms are "
-            "not stated; give covariances of whole poses"
-        )
+        option = "--lever-arm" if arm.any() else "--error right"
+        what = "moves errors of the rotation into that of the position, whose cross terms are not stated"
+        raise InputError(f"{poses.place[0]}: {option} {what}; give covariances of whole poses")
     R = np.full((len(poses.t), 3, 3), np.nan)
     finite = np.isfinite(poses.estimate).all(axis=1)
     if finite.any():
         R[finite] = Rotation.from_quat(poses.estimate[finite, 3:]).as_matrix()
     point = poses.estimate[:, :3] + R @ arm
-    J = _jacobian(poses.convention, R, arm, point)
-    P = J @ poses.covariance @ np.swapaxes(J, 1, 2)
+    of_truth = poses.true_covariance
+    if of_truth is not None:
+        of_truth = of_truth[:, :3, :3]
     return replace(
-        poses, estimate=point, covariance=0.5 * (P + np.swapaxes(P, 1, 2)), truth=poses.truth[:, :3],
-        manifold="vector", convention="vector", cross=None,
-        true_covariance=None if poses.true_covariance is None else poses.true_covariance[:, :3, :3],
+        poses, estimate=point, covariance=propagated(_jacobian(poses.convention, R, arm, point), poses.covariance),
+        truth=poses.truth[:, :3], manifold="vector", convention="vector", cross=None, true_covariance=of_truth,
     )  # fmt: skip
 
 
@@ -105,32 +100,42 @@ def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
     quaternions = np.concatenate([one.truth[:, 3:7] for one in poses])
     if (np.abs(np.abs(quaternions @ quaternions[0]) - 1.0) > SAME).any():
         return False, ""
-    angles, ways, bodies = [], [], []
-    for one in poses:
-        known = one.known()
-        finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
-        rows, true = known.rows[finite], known.truth[finite, :3]
-        if len(rows) < FEWEST:
-            continue
-        R = Rotation.from_quat(one.estimate[rows, 3:7])
-        sigma = np.sqrt(np.abs(np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)))
-        turned = (R[0].inv() * R).magnitude()
-        angles.append(float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0))))
-        way = np.diff(true, axis=0)
-        size = np.linalg.norm(way, axis=1)
-        moving = size > 0.1 * np.median(size)
-        way = way[moving] / size[moving, None]
-        if len(way):
-            ways.append(np.linalg.norm(way.mean(axis=0)))
-            bodies.append(np.linalg.norm(R[:-1][moving].inv().apply(way).mean(axis=0)))
-    if not angles or np.median(angles) < TURNED:
+    turns = [turn for one in poses if (turn := _turning(one)) is not None]
+    if not turns or np.median([turn[0] for turn in turns]) < TURNED:
         return False, ""
-    angle = np.rad2deg(np.median(angles))
-    text = f"the truth has the same orientation in every row, while the estimates turn by {angle:.0f} degrees"
-    of_way, of_body = (1.0 - float(np.mean(each)) if each else 0.0 for each in (ways, bodies))
-    if of_way > WINDING and of_body < ALIGNED * of_way:
+    angle, of_way, of_body = np.transpose(turns)
+    text = "the truth has the same orientation in every row, while the estimates turn by"
+    text = f"{text} {np.rad2deg(np.median(angle)):.0f} degrees"
+    way, body = (1.0 - np.nanmean(each) if np.isfinite(each).any() else 0.0 for each in (of_way, of_body))
+    if way > WINDING and body < ALIGNED * way:
         return True, f"{text} with the path: it is read as positions alone"
     return False, f"{text}; if it is a placeholder, give a truth of t x y z, or judge --axes x,y,z"
+
+
+def _turning(one: Poses) -> tuple[float, float, float] | None:
+    """By how much the estimates of a run turn beyond their covariance, rad; lengths of two mean directions.
+
+    They are of the true way in the world and in the axes of the estimated body, NaN where it stands still. None where
+    too few rows have a truth.
+    """
+    known = one.known()
+    finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
+    rows = known.rows[finite]
+    true = known.truth[finite, :3]
+    if len(rows) < FEWEST:
+        return None
+    R = Rotation.from_quat(one.estimate[rows, 3:7])
+    sigma = np.sqrt(np.abs(np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)))
+    turned = (R[0].inv() * R).magnitude()
+    turn = float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0)))
+    way = np.diff(true, axis=0)
+    size = np.linalg.norm(way, axis=1)
+    moving = size > 0.1 * np.median(size)
+    if not moving.any():
+        return turn, np.nan, np.nan
+    way = way[moving] / size[moving, None]
+    in_body = R[:-1][moving].inv().apply(way)
+    return turn, float(np.linalg.norm(way.mean(axis=0))), float(np.linalg.norm(in_body.mean(axis=0)))
 
 
 def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:
@@ -145,14 +150,14 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
     InputError
         An option needs orientations, or the covariance from elsewhere.
     """
-    names = ("covariance", "covariance_order", "error", "lever_arm")
-    if given := r.given(names):
+    if given := r.given(("covariance", "covariance_order", "error", "lever_arm")):
         raise InputError(f"{flag_of(given[0])}: does not go with {own.path}, of positions with their own covariances")
-    P = symmetric(own.values[:, 4:].reshape(-1, 3, 3), own.place)
+    if of_truth is not None:
+        of_truth = of_truth[:, :3, :3]
+    P = symmetric(own.covariances, own.place)
     return Poses(
         Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
-        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance,
-        true_covariance=None if of_truth is None else of_truth[:, :3, :3],
+        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance, true_covariance=of_truth,
     )  # fmt: skip
 
 

@@ -24,12 +24,13 @@ from consistency.referee.readers.formats.file_kinds import (
 )
 from consistency.referee.readers.formats.named_columns import DEVIATIONS, roles_of
 from consistency.referee.readers.formats.other_names import covariance_places
+from consistency.referee.readers.formats.pose_covariances import ORDERS, covariance_order
 from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS as SIZES
 from consistency.referee.readers.formats.pose_rows import POSE as POSE_COLUMNS
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES, OWN_NAMES, POSE
 from consistency.referee.readers.formats.text_blocks import opened
-from consistency.referee.readers.formats.tum import ORDERS, covariance_order, files_of_runs
+from consistency.referee.readers.formats.tum import files_of_runs
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,23 +18,28 @@ from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.pose_rows import POSE
-from consistency.referee.readers.formats.sheet import Lines
-from consistency.referee.readers.formats.tum import UNIT, SpaceRun, poses_of, space_estimator
+from consistency.referee.readers.formats.number_lines import Lines
+from consistency.referee.readers.formats.pose_covariances import require_spatial
+from consistency.referee.readers.formats.pose_rows import FULL, POSE
+from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.tum import SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
 from consistency.referee.readers.windows import MARGINAL
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
-FIX = "sensor_msgs/msg/NavSatFix"
-ESTIMATES = (*STATED, FIX)
+FIX = ("sensor_msgs/msg/NavSatFix",)
+ESTIMATES = STATED + FIX
 POSES = (*ESTIMATES, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped")
 TREE = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SECOND = 1e-9  # s in a nanosecond
 PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
 UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
 ENDLESS = 1e9  # a variance from which on it is not stated
+DAMAGED = "cannot be read as a ROS bag, damaged or cut short"
+Link = tuple[str, str]  # frames of a transform, parent and child
+Frames = tuple[str, str]  # of the world and of the body
 
 
 def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimator]:
@@ -52,17 +57,15 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     InputError
         A bag cannot be read, or lacks the topic; says which there are.
     """
-    bags = _bags(path)
+    bags = [path]
+    if not is_one_bag(path):
+        bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
         return [poses_of(path, [_bare_run(bag, r) for bag in bags], r)]
     if r.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
-    if r.error not in (None, *SPATIAL):
-        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-    if twice := _parts_of_one(bags):
-        raise InputError(
-            f"{path}: {twice} and others are parts of one recording; make its metadata by 'ros2 bag reindex'"
-        )
+    require_spatial(r.error, SPATIAL)
+    _require_whole(path, bags)
     why = "; as the ROS messages define it; declare yours with --error"
     mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
     found = space_estimator(path, (_run_of(bag, r) for bag in bags), r, why, mixed)
@@ -72,36 +75,55 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     return [replace(found, judged=judged, notes=(*found.notes, note))]
 
 
-def _bags(path: Path) -> list[Path]:
-    return [path] if is_one_bag(path) else sorted(part for part in path.iterdir() if is_one_bag(part))
+def _require_whole(path: Path, bags: Sequence[Path]) -> None:
+    """Refuse files of ROS 2 that are parts of one recording, as drive_0.db3 and drive_1.db3."""
+    recordings: dict[str, Path] = {}
+    for bag in bags:
+        part = PART.fullmatch(bag.stem)
+        if part is None or not bag.is_file() or bag.suffix == ".bag":
+            continue
+        first = recordings.setdefault(part[1], bag)
+        if first is not bag:
+            advice = "make its metadata by 'ros2 bag reindex'"
+            raise InputError(f"{path}: {first.name} and others are parts of one recording; {advice}")
 
 
 def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
-        topic, truth = _chosen(bag, reader, r.topic), r.truth_topic
-        if truth is None:
-            others = [name for name in _topics(reader, POSES) if name != topic]
-            raise InputError(
-                f"{bag}: needs --truth-topic, of poses or PARENT:CHILD of /tf; there are: {_listed(others, reader)}"
-            )
-        own = _lines(bag, reader, topic)
-        true = _lines(bag, reader, truth)
-        notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
-    covariance = 4 if isinstance(true, Fixes) else POSE
+        run = _run_on(bag, reader, r, _chosen(bag, reader, r.topic), ", of poses or PARENT:CHILD of /tf")
+    numbers = 4 if isinstance(run.true, Fixes) else POSE  # of a row before its covariance
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
-    if r.truth_covariance is not None and not (true.values[:, covariance:] > 0).any():
+    if r.truth_covariance is not None and not (run.true.values[:, numbers:] > 0).any():
         raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
-    if not np.isfinite(true.values[:, 1:covariance]).all():
-        raise InputError(f"{bag}: the truth on {truth} is not finite")
-    return SpaceRun(own, true, (bag, f"{r.truth_topic} of {bag}"), notes=notes)
+    if not np.isfinite(run.true.values[:, 1:numbers]).all():
+        raise InputError(f"{bag}: the truth on {r.truth_topic} is not finite")
+    return run
 
 
-def _parts_of_one(bags: Sequence[Path]) -> str:
-    """Name of a file of ROS 2 that has another part beside it, as drive_0.db3 and drive_1.db3; "" without any."""
-    stems = [match[1] for bag in bags if bag.is_file() and (match := PART.fullmatch(bag.stem)) and bag.suffix != ".bag"]
-    return next((bag.name for bag in bags if (match := PART.fullmatch(bag.stem)) and stems.count(match[1]) > 1), "")
+def _bare_run(bag: Path, r: Reading) -> SpaceRun:
+    """Poses of a bag, of a topic with or without covariances."""
+    with _opened(bag) as reader:
+        topic = r.topic
+        if topic not in _topics(reader, POSES):
+            topic = _chosen(bag, reader, topic)
+        run = _run_on(bag, reader, r, topic)
+    if isinstance(run.own, Fixes) or isinstance(run.true, Fixes):
+        raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
+    return run
+
+
+def _run_on(bag: Path, reader: Any, r: Reading, topic: str, needed: str = "") -> SpaceRun:
+    """A run on a topic beside that of the truth; ``needed`` says in a message what the latter may be."""
+    truth = r.truth_topic
+    if truth is None:
+        there = [name for name in _topics(reader, POSES) if name != topic]
+        raise InputError(f"{bag}: needs --truth-topic{needed}; there are: {_listed(there, reader)}")
+    own = _lines(bag, reader, topic)
+    true = _lines(bag, reader, truth)
+    notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
+    return SpaceRun(own, true, (bag, f"{truth} of {bag}"), notes=notes)
 
 
 def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
@@ -115,32 +137,29 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
         None is stated.
     """
     variances = np.concatenate([np.diagonal(one.covariance, axis1=1, axis2=2) for one in poses])
-    n = variances.shape[1]
     none = (variances == 0).all(axis=0) | (variances >= ENDLESS).all(axis=0) | np.isnan(variances).all(axis=0)
-    for first in range(0, n, 3):
-        none[first : first + 3] |= bool((variances[:, first] == -1).all())
-    left = np.flatnonzero(~none).tolist()
-    if not left:
-        raise InputError(f"{path}: states no covariance: its variances are 0, -1 or {ENDLESS:g} in every message")
-    missing = ",".join(AXES[i] for i in range(n) if i not in left)
-    if not missing:
-        return left, ""
-    what = f"{path}: the variances of {missing} are 0, -1 or {ENDLESS:g} in every message, so not stated and not judged"
-    return left, what
+    none |= np.repeat((variances[:, ::3] == -1).all(axis=0), 3)
+    values = f"0, -1 or {ENDLESS:g} in every message"
+    if none.all():
+        raise InputError(f"{path}: states no covariance: its variances are {values}")
+    missing = ",".join(AXES[i] for i in np.flatnonzero(none))
+    note = f"{path}: the variances of {missing} are {values}, so not stated and not judged"
+    return np.flatnonzero(~none).tolist(), note if missing else ""
 
 
-def _other_frames(bag: Path, *of: tuple[str, tuple[str, str]]) -> list[str]:
+def _other_frames(bag: Path, estimates: tuple[str, Frames], truth: tuple[str, Frames]) -> list[str]:
     """A note on frames of estimates and truth by other names, which may be the same."""
-    (topic, own), (truth, true) = of
+    topic, own = estimates
+    true_topic, true = truth
     notes = []
     remedies = "add --align where they are not the same", "the poses must be of one body"
     for which, a, b, advice in zip(("world", "body"), own, true, remedies, strict=True):
         if a and b and a != b:
-            notes.append(f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {truth}; {advice}")
+            notes.append(f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {true_topic}; {advice}")
     return notes
 
 
-# --- messages ---------------------------------------------------------------------------------------
+# --- topics -----------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -150,11 +169,11 @@ def _opened(bag: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingPackageError(f"{bag}: a ROS bag needs {remedy('ros', package='rosbags')}") from None
-    with reading(bag, "cannot be read as a ROS bag, damaged or cut short"):
+    with reading(bag, DAMAGED):
         reader = AnyReader([bag], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     try:
-        with reading(bag, "cannot be read as a ROS bag, damaged or cut short"):
+        with reading(bag, DAMAGED):
             yield reader
     finally:
         reader.close()
@@ -170,78 +189,50 @@ def _listed(topics: Sequence[str], reader: Any) -> str:
 
 
 def _chosen(bag: Path, reader: Any, topic: str | None) -> str:
-    there = _topics(reader, STATED) or _topics(reader, (FIX,))
-    if topic is None and len(there) == 1:
-        return there[0]
-    if topic not in (there := _topics(reader, ESTIMATES)):
-        asked = "needs --topic" if topic is None else f"--topic {topic}: is not there with poses and covariances"
-        raise InputError(f"{bag}: {asked}; there are: {', '.join(there) or 'none that would do'}")
-    return str(topic)
+    likely = _topics(reader, STATED) or _topics(reader, FIX)
+    if topic is None and len(likely) == 1:
+        return likely[0]
+    there = _topics(reader, ESTIMATES)
+    if topic in there:
+        return str(topic)
+    asked = "needs --topic"
+    if topic is not None:
+        asked = f"--topic {topic}: is not there with poses and covariances"
+    raise InputError(f"{bag}: {asked}; there are: {', '.join(there) or 'none that would do'}")
 
 
-def _raw(reader: Any, topic: str) -> Iterator[Any]:
-    connections = [connection for connection in reader.connections if connection.topic == topic]
+def _messages(reader: Any, wanted: str | Sequence[str]) -> Iterator[Any]:
+    """Messages of a topic, or of all topics of some kinds."""
+    connections = []
+    for connection in reader.connections:
+        if connection.topic == wanted or (connection.msgtype in wanted and not isinstance(wanted, str)):
+            connections.append(connection)
+    if not connections:  # of none the reader gives all
+        return
     for connection, _, raw in reader.messages(connections=connections):
         yield reader.deserialize(raw, connection.msgtype)
 
 
-def _frames(reader: Any, topic: str) -> tuple[str, str]:
+def _frames(reader: Any, topic: str) -> Frames:
     """World and body by the first message of a topic, or of PARENT:CHILD; "" where it does not name one."""
     if ":" in topic:
-        parent, child = topic.split(":", 1)
-        return parent.strip().lstrip("/"), child.strip().lstrip("/")
-    first = next(_raw(reader, topic), None)
+        return _link(topic)
+    first = next(_messages(reader, topic), None)
     if first is None:
         return "", ""
-    frame, child = first.header.frame_id.lstrip("/"), getattr(first, "child_frame_id", "").lstrip("/")
-    return ("", frame) if hasattr(first, "latitude") else (frame, child)
+    frame = first.header.frame_id.lstrip("/")
+    if hasattr(first, "latitude"):
+        return "", frame
+    return frame, getattr(first, "child_frame_id", "").lstrip("/")
 
 
-def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
-    """Poses of one frame of /tf in another, along the links between both.
-
-    Their times are those of the link with most messages, while all others that move are known; between its messages a
-    link moves evenly, as tf has it, and one with a single message stands still.
-    """
-    parent, child = (frame.strip().lstrip("/") for frame in frames.split(":", 1))
-    connections = [connection for connection in reader.connections if connection.msgtype in TREE]
-    links: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
-    for connection, _, raw in reader.messages(connections=connections) if connections else ():  # of none it gives all
-        for each in reader.deserialize(raw, connection.msgtype).transforms:
-            pair = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-            links.setdefault(pair, []).append((each.header, each.transform))
-    chain = _chain(list(links), parent, child)
-    if not chain:
-        has = ", ".join(sorted(map(":".join, links))) or "none"
-        raise InputError(f"{bag}: --truth-topic {frames}: is not a transform of /tf; there are: {has}")
-    tracks = {pair: _track(bag, ":".join(pair), iter(links[pair])) for pair, _ in chain}
-    longest = max(tracks.values(), key=lambda lines: len(lines.t))
-    if chain == [((parent, child), True)]:
-        return longest
-    moving = [lines.t for lines in tracks.values() if len(lines.t) > 1] or [longest.t]
-    rows = (longest.t >= max(t[0] for t in moving)) & (longest.t <= min(t[-1] for t in moving))
-    if not rows.any():
-        raise InputError(f"{bag}: --truth-topic {frames}: its links are at no time known together")
-    t = longest.t[rows]
-    T = np.eye(4)
-    for pair, forward in chain:
-        own = tracks[pair]
-        link = matrices(truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth)
-        T = T @ (link if forward else inverse(link))
-    values = np.column_stack([t, vectors(T), np.full((len(t), 36), np.nan)])
-    return replace(longest, values=values, line=longest.line[rows], unit=f"message of {frames}")
+def _link(frames: str) -> Link:
+    """Parent and child of PARENT:CHILD."""
+    parent, child = frames.split(":", 1)
+    return parent.strip().lstrip("/"), child.strip().lstrip("/")
 
 
-def _chain(pairs: Sequence[tuple[str, str]], start: str, end: str) -> list[tuple[tuple[str, str], bool]]:
-    """The links from one frame to another, each with whether it is taken from parent to child; none if apart."""
-    ways: dict[str, list[tuple[tuple[str, str], bool]]] = {start: []}
-    for frame in (queue := [start]):
-        for pair in pairs:
-            for here, there, forward in ((*pair, True), (*pair[::-1], False)):
-                if here == frame and there not in ways:
-                    ways[there] = [*ways[frame], (pair, forward)]
-                    queue.append(there)
-    return ways.get(end, [])
+# --- poses ------------------------------------------------------------------------------------------
 
 
 def _lines(bag: Path, reader: Any, topic: str) -> Lines:
@@ -250,73 +241,112 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
         return _transforms(bag, reader, topic)
     if topic not in (there := _topics(reader, POSES)):
         raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
-    if topic in _topics(reader, (FIX,)):
-        return _fixes(bag, topic, list(_raw(reader, topic)))
-    messages = ((each.header, getattr(each, "pose", None) or each.transform) for each in _raw(reader, topic))
-    return _track(bag, topic, messages)
+    if topic in _topics(reader, FIX):
+        return _fixes(bag, topic, list(_messages(reader, topic)))
+    rows = (_row(each.header, getattr(each, "pose", None) or each.transform) for each in _messages(reader, topic))
+    return _track(bag, topic, rows)
 
 
 def _fixes(bag: Path, topic: str, messages: Sequence[Any]) -> Fixes:
     """Positions of NavSatFix messages, without those that have no fix; of equal stamps the first."""
-    kept = [each for each in messages if each.status.status >= 0]
-    if not kept:
+    rows = []
+    kinds = set()
+    for each in messages:
+        if each.status.status < 0:
+            continue
+        kinds.add(int(each.position_covariance_type))
+        P = np.asarray(each.position_covariance, float)
+        if each.position_covariance_type == UNKNOWN:
+            P = np.full(9, np.nan)
+        rows.append([_stamp(each.header), each.latitude, each.longitude, each.altitude, *P])
+    if not rows:
         raise InputError(f"{bag}: {topic} holds no message with a fix")
-    rows = [[_stamp(each.header), each.latitude, each.longitude, each.altitude] for each in kept]
-    kinds = {int(each.position_covariance_type) for each in kept}
-    P = np.array([np.asarray(each.position_covariance, float) for each in kept])
-    P[[each.position_covariance_type == UNKNOWN for each in kept]] = np.nan
-    if kinds <= {DIAGONAL}:
-        P *= np.eye(3).ravel()
-    values = np.column_stack([np.array(rows, float), P])
-    _, first = np.unique(values[:, 0], return_index=True)
-    note = f"{bag}: {topic} read as positions by satellite, {len(kept)} of {len(messages)} messages with a fix"
-    alone = kinds <= {DIAGONAL}
+    note = f"{bag}: {topic} read as positions by satellite, {len(rows)} of {len(messages)} messages with a fix"
+    values = np.array(rows, float)
+    alone = kinds == {DIAGONAL}
     if alone:
+        values[:, 4:] *= np.eye(3).ravel()
         note += ", deviations alone"
+    _, first = np.unique(values[:, 0], return_index=True)
     return Fixes(bag, values[first], first + 1, note, f"message of {topic}", alone=alone)
 
 
-def _track(bag: Path, topic: str, messages: Iterator[tuple[Any, Any]]) -> Lines:
+def _track(bag: Path, topic: str, rows: Iterable[Array]) -> Lines:
     """Poses in order of their stamps; of several with the same stamp only the first."""
-    rows = [_row(header, content) for header, content in messages]
-    if not rows:
+    values = np.array(list(rows))
+    if not len(values):
         raise InputError(f"{bag}: {topic} holds no message")
-    t, pose, covariance = (np.array(column, float) for column in zip(*rows, strict=True))
-    _, first = np.unique(t, return_index=True)
-    pose = pose[first]
-    length = np.linalg.norm(pose[:, 3:], axis=1)
-    bad = np.flatnonzero(np.isfinite(pose).all(axis=1) & (np.abs(length - 1.0) > UNIT))
-    if len(bad):
-        raise InputError(
-            f"{bag}, {topic}: the quaternion at {t[first][bad[0]]:.15g} s has length {length[bad[0]]:.4g}, not 1"
-        )
-    return Lines(bag, np.column_stack([t[first], pose, covariance[first]]), first + 1, unit=f"message of {topic}")
+    t, first = np.unique(values[:, 0], return_index=True)
+    values = values[first]
+    bad, length = not_unit(values[:, 1:POSE])
+    for row in np.flatnonzero(bad):
+        what = f"the quaternion at {t[row]:.15g} s has length {length[row]:.4g}, not 1"
+        raise InputError(f"{bag}, {topic}: {what}")
+    return Lines(bag, values, first + 1, unit=f"message of {topic}")
 
 
-def _row(header: Any, content: Any) -> tuple[float, list[float], Array]:
-    """Stamp, s, pose (7,) and covariance (36,) of a message; NaN without a covariance."""
+def _row(header: Any, content: Any) -> Array:
+    """Stamp, s, pose and covariance of a message, (44,); NaN without a covariance."""
     covariance = getattr(content, "covariance", None)
     pose = content if covariance is None else content.pose
-    position = getattr(pose, "position", None) or pose.translation
-    turn = getattr(pose, "orientation", None) or pose.rotation
-    values = [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
-    return _stamp(header), values, np.full(36, np.nan) if covariance is None else np.asarray(covariance, float)
+    if covariance is None:
+        covariance = np.full(FULL, np.nan)
+    p = getattr(pose, "position", None) or pose.translation
+    q = getattr(pose, "orientation", None) or pose.rotation
+    return np.array([_stamp(header), p.x, p.y, p.z, q.x, q.y, q.z, q.w, *covariance], float)
 
 
 def _stamp(header: Any) -> float:
     return float(header.stamp.sec + SECOND * header.stamp.nanosec)
 
 
-def _bare_run(bag: Path, r: Reading) -> SpaceRun:
-    """Poses of a bag, of a topic with or without covariances."""
-    with _opened(bag) as reader:
-        topic = r.topic
-        if topic not in _topics(reader, POSES):
-            topic = _chosen(bag, reader, r.topic)
-        if r.truth_topic is None:
-            others = [name for name in _topics(reader, POSES) if name != topic]
-            raise InputError(f"{bag}: needs --truth-topic; there are: {_listed(others, reader)}")
-        own, true = (_lines(bag, reader, each) for each in (topic, r.truth_topic))
-    if isinstance(own, Fixes) or isinstance(true, Fixes):
-        raise InputError(f"{bag}: positions by satellite have no orientations, which motions need")
-    return SpaceRun(own, true, (bag, f"{r.truth_topic} of {bag}"))
+# --- frames of /tf ----------------------------------------------------------------------------------
+
+
+def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
+    """Poses of one frame of /tf in another, along the links between both.
+
+    Their times are those of the link with most messages, while all others that move are known; between its messages a
+    link moves evenly, as tf has it, and one with a single message stands still.
+    """
+    rows: dict[Link, list[Array]] = {}
+    for message in _messages(reader, TREE):
+        for each in message.transforms:
+            link = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+            rows.setdefault(link, []).append(_row(each.header, each.transform))
+    chain = _chain(list(rows), _link(frames))
+    where = f"{bag}: --truth-topic {frames}"
+    if not chain:
+        has = ", ".join(sorted(map(":".join, rows))) or "none"
+        raise InputError(f"{where}: is not a transform of /tf; there are: {has}")
+    tracks = {link: _track(bag, ":".join(link), rows[link]) for link, _ in chain}
+    longest = max(tracks.values(), key=lambda lines: len(lines.t))
+    if chain == [(_link(frames), True)]:
+        return longest
+    together = np.ones(len(longest.t), bool)
+    for lines in tracks.values():
+        if len(lines.t) > 1:
+            together &= (longest.t >= lines.t[0]) & (longest.t <= lines.t[-1])
+    if not together.any():
+        raise InputError(f"{where}: its links are at no time known together")
+    t = longest.t[together]
+    T = np.eye(4)
+    for link, forward in chain:
+        own = tracks[link]
+        step = matrices(truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth)
+        T = T @ (step if forward else inverse(step))
+    values = np.column_stack([t, vectors(T), np.full((len(t), FULL), np.nan)])
+    return replace(longest, values=values, line=longest.line[together], unit=f"message of {frames}")
+
+
+def _chain(links: Sequence[Link], ends: Link) -> list[tuple[Link, bool]]:
+    """The links from one frame to another, each with whether it is taken from parent to child; none if apart."""
+    start, end = ends
+    ways: dict[str, list[tuple[Link, bool]]] = {start: []}
+    for frame in (queue := [start]):
+        for link in links:
+            for here, there, forward in ((*link, True), (*link[::-1], False)):
+                if here == frame and there not in ways:
+                    ways[there] = [*ways[frame], (link, forward)]
+                    queue.append(there)
+    return ways.get(end, [])

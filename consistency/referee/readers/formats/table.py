@@ -12,6 +12,7 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.readers.formats import table_columns as columns
 from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
@@ -23,18 +24,8 @@ from consistency.referee.readers.formats.other_names import (
     with_known_names,
 )
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.table_columns import (
-    POSE,
-    by_run,
-    cross_covariances,
-    has_own,
-    nis_columns,
-    own_column,
-    require_columns,
-    stated_covariance,
-    stated_deviations,
-)
-from consistency.referee.readers.options import COLUMNS, Reading
+from consistency.referee.readers.formats.table_columns import POSE
+from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
 from consistency.referee.types import Array
@@ -54,17 +45,17 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
     """
     if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
         raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    axes = tuple(r.state) if r.state else POSE
+    axes = tuple(r.state or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
     convention = _convention(r.error, axes, truth)
     _require_truth(sheet, truth, axes, convention, r)
     key = _key(sheet, truth, r)
-    names = [sheet.path.stem]
+    of_filters = {sheet.path.stem: sheet}
     if "filter" in sheet:
-        names = list(dict.fromkeys(sheet.texts("filter")))
+        filters = sheet.texts("filter")
+        of_filters = {name: sheet.rows(filters == name) for name in dict.fromkeys(filters)}
     found = []
-    for name in names:
-        own = sheet.rows(sheet.texts("filter") == name) if "filter" in sheet else sheet
+    for name, own in of_filters.items():
         true = truth if r.truth is not None else true_columns(own, axes)
         if true is None:
             found.append(_innovations(name, own, key, axes))
@@ -77,52 +68,60 @@ def _both(
     estimates: Path | TableRows, axes: tuple[str, ...], r: Reading
 ) -> tuple[TableRows, TableRows | None, list[str]]:
     """Estimates and truth, which may stand beside them, with times where steps do not number both, and notes."""
-    sheet, note = _sheet(estimates, axes, r.columns, bool(r.motions))
-    other, notes = None, [sheet.cut, note]
+    sheet, read_as = _sheet(estimates, axes, r.columns, bool(r.motions))
+    notes = [sheet.cut, read_as]
+    truth = None
     if r.truth is not None:
-        other, note = _sheet(r.truth, axes, r.truth_columns, body=r.body)
-        notes = [sheet.cut, other.cut, *notes[1:], note]
-    timed = r.time_offset is not None or r.max_dt is not None
-    if timed or not ("step" in sheet and (other is None or "step" in other)):
-        sheet, other = with_clock(sheet), None if other is None else with_clock(other)
-    if other is None and (other := true_columns(sheet, axes)) is not None:
-        notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
-    return sheet, other, [note for note in notes if note]
+        truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
+        notes = [sheet.cut, truth.cut, notes[1], read_as]
+    by_step = "step" in sheet and (truth is None or "step" in truth)
+    if not by_step or r.time_offset is not None or r.max_dt is not None:
+        sheet = with_clock(sheet)
+        if truth is not None:
+            truth = with_clock(truth)
+    if truth is None:
+        truth = true_columns(sheet, axes)
+        if truth is not None:
+            notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
+    return sheet, truth, [note for note in notes if note]
 
 
 def _sheet(
     table: Path | TableRows,
     axes: tuple[str, ...],
-    columns: Columns | None = None,
+    renaming: Columns | None = None,
     motions: bool = False,
     body: str | None = None,
 ) -> tuple[TableRows, str]:
     """Rows of a file or a drive, or those in memory, under the names of docs/files.md, and what they were read as."""
     note = ""
     if isinstance(table, TableRows):
-        sheet = table.renamed(columns)
+        sheet = table.renamed(renaming)
     elif is_drive(table):
         from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         sheet = drive_sheet(table, body)
     elif axes == POSE:
-        sheet, note = planar_sheet(table, motions, columns)
+        sheet, note = planar_sheet(table, motions, renaming)
     else:
-        sheet = read_sheet(table, columns)
+        sheet = read_sheet(table, renaming)
     sheet, taken = with_known_names(sheet, axes)
     return sheet, "; ".join(filter(None, (note, taken)))
 
 
-def planar_sheet(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
+def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = None) -> tuple[TableRows, str]:
     """A table of planar poses, and what it was read as where it has no columns x, y, heading."""
-    head = None if path.suffix.lower() in (".parquet", ".pq") or not path.is_file() else head_of(path, columns)
-    named = head is not None and not head.comment and set(POSE) <= set(head.names)
-    unnamed = head is None and not begins_with_numbers(path)
-    if unnamed or named or not (is_poses(path, columns) or is_plane(path, columns)):
-        return read_sheet(path, columns), ""
+    head = None
+    if path.suffix.lower() not in (".parquet", ".pq") and path.is_file():
+        head = head_of(path, renaming)
+    is_table = head is None and not begins_with_numbers(path)
+    if head is not None:
+        is_table = not head.comment and set(POSE) <= set(head.names)
+    if is_table or not (is_poses(path, renaming) or is_plane(path, renaming)):
+        return read_sheet(path, renaming), ""
     from consistency.referee.readers.formats.planar_columns import read_plane
 
-    return read_plane(path, motions, columns)
+    return read_plane(path, motions, renaming)
 
 
 # --- what goes together ------------------------------------------------------------------------------
@@ -150,10 +149,10 @@ def _require_truth(
         raise InputError(f"{sheet.path}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and convention == "vector":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
-    if truth is None and not {"nis", "nis_dof"} <= set(sheet.data):
+    if truth is None and not sheet.has("nis", "nis_dof"):
         others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
         state = ""
-        if not any(axis in sheet for axis in axes):
+        if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
         require_true_columns(sheet, axes)
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
@@ -163,19 +162,19 @@ def _require_truth(
 
 def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     """The column that says which estimate belongs to which truth."""
-    timed = "t" in sheet and truth is not None and "t" in truth
+    true = sheet if truth is None else truth
+    timed = truth is not None and "t" in sheet and "t" in truth
+    key = next((key for key in ("step", "t") if key in sheet and key in true), None)
     if r.time_offset is not None:
-        if timed:
-            return "t"
-        raise InputError("--time-offset: needs a column t in the estimates and in the truth")
-    for key in ("step", "t"):
-        if key in sheet and (truth is None or key in truth):
-            if r.max_dt is not None and not timed:
-                raise InputError("--max-dt: needs a column t in the estimates and in the truth")
-            return key
-    if truth is not None and ("step" in sheet or "t" in sheet):
-        has = next(key for key in ("step", "t") if key in sheet)
-        raise InputError(f"{truth.path}: column '{has}' is missing; {sheet.path} is numbered by it")
+        key = "t"
+    for option in ("time_offset", "max_dt"):
+        if r.given([option]) and key is not None and not timed:
+            raise InputError(f"{flag_of(option)}: needs a column t in the estimates and in the truth")
+    if key is not None:
+        return key
+    for has in ("step", "t"):
+        if has in sheet:
+            raise InputError(f"{true.path}: column '{has}' is missing; {sheet.path} is numbered by it")
     hint = ""
     if len(sheet.data) == 1 and " " in sheet.columns:
         hint = "; separate columns by commas, semicolons or tabs"
@@ -186,28 +185,13 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
 # --- poses -------------------------------------------------------------------------------------------
 
 
-def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
-    """The poses of each run, named as in a study of drives, of those of all rows."""
-    found = []
-    for run in np.unique(runs):
-        rows, name = np.flatnonzero(runs == run), sheet.path.stem
-        if "run" in sheet:
-            name = f"run {run}"
-        one = poses.of_rows(rows)
-        found.append(replace(one, run=int(run), name=name, open_end=sheet.open_end(int(rows[-1]))))
-    return found
-
-
-def _clock(sheet: TableRows) -> Array | None:
-    return sheet.numbers("t") if "t" in sheet else None
-
-
 def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> Estimator:
     """Innovations without a truth; a row whose state is broken has no estimate."""
-    sheet, runs = by_run(sheet, key)
-    nothing, t = np.zeros((len(sheet), 1)), sheet.numbers(key, finite=True)
-    state = np.column_stack([nothing, *(sheet.numbers(axis) for axis in axes if axis in sheet)])
-    nis, dof = nis_columns(sheet)
+    sheet, runs = columns.by_run(sheet, key)
+    nothing = np.zeros((len(sheet), 1))
+    t = sheet.numbers(key, finite=True)
+    state = np.column_stack([nothing, *map(sheet.numbers, sheet.among(axes))])
+    nis, dof = columns.nis_columns(sheet)
     poses = Poses(
         Places(sheet.place, np.arange(len(sheet))), t, state, *unstated(len(sheet), 1), t, nothing, "vector", "vector",
         0.0, numbered=key == "step", clock=_clock(sheet), nis=nis, nis_dof=dof,
@@ -226,61 +210,79 @@ def _estimator(
     poses_alone: bool,
 ) -> Estimator:
     """The runs of an estimator beside their truth."""
-    require_columns(sheet, axes)
-    require_columns(truth, axes)
-    (sheet, runs), (truth, true_runs) = by_run(sheet, key), by_run(truth, key)
+    columns.require_columns(sheet, axes)
+    columns.require_columns(truth, axes)
+    sheet, runs = columns.by_run(sheet, key)
+    truth, true_runs = columns.by_run(truth, key)
     covariance, known = unstated(len(sheet), len(axes))
-    notes, stated = _absent(name, truth, runs, true_runs), WHOLE
+    notes = _absent(name, truth, runs, true_runs)
+    stated = WHOLE
     cross = of_truth = None
     if not poses_alone:
-        covariance, stated, said = _covariance(name, sheet, axes, convention)
-        known, notes = np.ones(len(sheet), bool), [*notes, *said]
+        covariance, stated, note = _covariance(name, sheet, axes, convention)
+        known = np.ones(len(sheet), bool)
+        notes += filter(None, [note])
     if r.relative is not None and not r.motions:
-        cross = cross_covariances(sheet)
+        cross = columns.cross_covariances(sheet)
     if r.truth_covariance is not None:
-        of_truth = stated_covariance(truth, axes)
-    estimate = np.column_stack([sheet.numbers(axis) for axis in axes])
+        of_truth = columns.stated_covariance(truth, axes)
+    estimate = sheet.matrix(axes)
     estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
-    nis, dof = nis_columns(sheet)
+    nis, dof = columns.nis_columns(sheet)
     by_step = key == "step"
     poses = Poses(
         Places(sheet.place, np.arange(len(sheet))), sheet.numbers(key, finite=True), estimate, covariance, known,
-        truth.numbers(key), np.column_stack([truth.numbers(axis, finite=True) for axis in axes]),
-        manifold_of(convention), convention, 0.0 if by_step else r.tolerance, cross, of_truth,
-        files=(sheet.path, truth.path), numbered=by_step, clock=_clock(sheet), true_clock=_clock(truth), nis=nis,
-        nis_dof=dof, by=own_column(sheet, r),
+        truth.numbers(key), truth.matrix(axes, finite=True), manifold_of(convention), convention,
+        0.0 if by_step else r.tolerance, cross, of_truth, files=(sheet.path, truth.path), numbered=by_step,
+        clock=_clock(sheet), true_clock=_clock(truth), nis=nis, nis_dof=dof, by=columns.own_column(sheet, r),
     )  # fmt: skip
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
         of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
-    if missing := [one.run for one in of_runs if not len(one.true_t)]:
-        has = ", ".join(map(str, np.unique(true_runs)[:5]))
-        serves = "without a column 'run' it serves all"
-        raise InputError(f"{truth.path}: holds no run {missing[0]} (it has {has}); {serves}")
+    for one in of_runs:
+        if not len(one.true_t):
+            has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
+            raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
+    definition = PLANAR[convention]
     return Estimator(
-        name, sheet.path, of_runs, axes, convention, PLANAR[convention], stated, notes=notes, position=_position(axes)
+        name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, position=_position(axes)
     )
+
+
+def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
+    """The poses of each run, named as in a study of drives, of those of all rows."""
+    found = []
+    for run in np.unique(runs):
+        rows = np.flatnonzero(runs == run)
+        name = sheet.path.stem
+        if "run" in sheet:
+            name = f"run {run}"
+        one = poses.of_rows(rows)
+        found.append(replace(one, run=int(run), name=name, open_end=sheet.open_end(int(rows[-1]))))
+    return found
+
+
+def _clock(sheet: TableRows) -> Array | None:
+    return sheet.numbers("t") if "t" in sheet else None
 
 
 def _position(axes: Sequence[str]) -> int:
     """Leading components that are a position."""
-    if tuple(axes[:2]) != ("x", "y"):
-        return 0
-    if tuple(axes[2:3]) == ("z",):
+    if tuple(axes[:3]) == ("x", "y", "z"):
         return 3
-    return 2
+    return 2 if tuple(axes[:2]) == ("x", "y") else 0
 
 
-def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, list[str]]:
-    """Covariances (N, n, n), which of them are stated, and notes on them."""
-    if convention != ADDITIVE and axes == POSE and has_own(sheet):
-        of = "is that of the columns own_P_*, which are of the filter's own error"
-        return stated_covariance(sheet, axes, own=True), WHOLE, [f"{name}: the covariance {of}"]
-    deviations = stated_deviations(sheet, axes)
+def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:
+    """Covariances (N, n, n), which of them are stated, and a note on them."""
+    if convention != ADDITIVE and axes == POSE and columns.has_own(sheet):
+        note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
+        return columns.stated_covariance(sheet, axes, own=True), WHOLE, note
+    deviations = columns.stated_deviations(sheet, axes)
     if deviations is None:
-        return stated_covariance(sheet, axes), WHOLE, []
+        return columns.stated_covariance(sheet, axes), WHOLE, ""
     note = f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
-    return diagonal(deviations), ALONE, [note]
+    return diagonal(deviations), ALONE, note
 
 
 def _absent(name: str, truth: TableRows, runs: Array, true_runs: Array) -> list[str]:

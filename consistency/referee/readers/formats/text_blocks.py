@@ -3,90 +3,88 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading, require_room
-from consistency.referee.types import Array, Indices
+from consistency.referee.readers.places import cut_note
+from consistency.referee.types import Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
 WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and a character of ASCII
-SPECIAL = b'"#\x0b\x0c\x1c\x1d\x1e'  # quotes, comments, and what str.splitlines takes for the end of a line
-IS_SPACE = np.isin(np.arange(256), np.frombuffer(b" \t\r\n", np.uint8))
-NEWLINE = ord("\n")
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """Whole lines of a text file."""
 
-    path: Path
-    data: bytes
-    first: int  # number of its first line in the file, from 1
-    ends: bool = True  # its last line has an end; otherwise it is the last line of the file alone
+    rows: list[str]
+    first: int  # number of the first one in the file, from 1
+    ends: bool  # the last one has an end; otherwise it is the last line of the file alone
 
-    @cached_property
-    def plain(self) -> bool:
-        """Whether it is ASCII without quotes and comments, its lines ending in LF or CR LF."""
-        data = self.data
-        ends = data.count(b"\r") == data.count(b"\r\n")
-        return ends and data.isascii() and len(data.translate(None, SPECIAL)) == len(data)
-
-    @cached_property
-    def text(self) -> str:
-        """The characters; raises :class:`InputError` where it is not UTF-8."""
-        with reading(self.path, REFUSAL):
-            return self.data.decode("utf-8")
-
-    @cached_property
-    def count(self) -> int:
-        return len(self._starts) if self.plain else len(self.text.splitlines())
-
-    def lines(self) -> list[tuple[int, str]]:
+    def lines(self) -> Iterator[tuple[int, str]]:
         """Lines with their numbers, without comments and empty lines."""
-        numbered = enumerate(self.text.splitlines(), self.first)
-        return [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+        for number, line in enumerate(self.rows, self.first):
+            text = line.lstrip()
+            if text and text[0] != "#":
+                yield number, line
 
-    def count_of(self, character: bytes) -> Indices:
-        return self._per_line(np.frombuffer(self.data, np.uint8) == ord(character))
 
-    def numbers(self, separator: bytes = b",") -> tuple[Array, Indices] | None:
-        """Rows of numbers (N, columns), separators taken as spaces, and the numbers (N,) of their lines.
+class LineParser:
+    """How the lines of a text file become rows; each layout has its own."""
 
-        None if the block holds anything else, or lines of unequal length: it must then be read line by line.
-        """
-        if not self.plain or b"_" in self.data:
-            return None
-        data = self.data.replace(separator, b" ")
-        space = IS_SPACE[np.frombuffer(data, np.uint8)]
-        begins = ~space
-        begins[1:] &= space[:-1]
-        fields = self._per_line(begins)
-        full = np.flatnonzero(fields)
-        if not len(full) or (fields[full] != fields[full[0]]).any():
-            return None
-        try:
-            values = np.fromiter(map(float, data.split()), float)
-        except ValueError:
-            return None
-        return values.reshape(len(full), -1), self.first + full
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
-    @cached_property
-    def _starts(self) -> Indices:
-        after = np.flatnonzero(np.frombuffer(self.data, np.uint8) == NEWLINE) + 1
-        return np.concatenate([[0], after[after < len(self.data)]])
+    def row(self, number: int, line: str) -> Any:
+        """What a line holds; None where it is a header."""
+        raise NotImplementedError
 
-    def _per_line(self, marks: Array) -> Indices:
-        return np.asarray(np.add.reduceat(marks, self._starts, dtype=np.int64))
+    def part(self, rows: list[Any], numbers: list[int]) -> Any:
+        """What the rows of a block are kept as; ``numbers`` are those of their lines."""
+        return rows
+
+    def is_whole(self, line: str, above: Any) -> bool:
+        """Whether a last line without an end is like the part of the file above it; else it is left out."""
+        raise NotImplementedError
+
+
+class Parsed(NamedTuple):
+    """What the lines of a file hold."""
+
+    parts: list[Any]  # of each block with rows
+    line: Indices  # (N,), number of the line of each row
+    open_line: int = 0  # line of the last row if it has no end, and may be cut short; 0 otherwise
+    cut: str = ""  # note on a line that is left out, because it is
+
+
+def parsed(parser: LineParser) -> Parsed:
+    """A text file, parsed block by block."""
+    parts: list[Any] = []
+    line_numbers: list[int] = []
+    open_line = 0
+    cut = ""
+    for block in blocks(parser.path):
+        rows = []
+        numbers = []
+        for number, line in block.lines():
+            if parts and not block.ends and not parser.is_whole(line, parts[-1]):
+                cut = cut_note(parser.path, number)
+            elif (row := parser.row(number, line)) is not None:
+                rows.append(row)
+                numbers.append(number)
+        if rows:
+            parts.append(parser.part(rows, numbers))
+            line_numbers += numbers
+            open_line = 0 if block.ends else numbers[-1]
+    return Parsed(parts, np.array(line_numbers, int), open_line, cut)
 
 
 def blocks(path: Path) -> Iterator[Block]:
@@ -95,7 +93,7 @@ def blocks(path: Path) -> Iterator[Block]:
     Raises
     ------
     InputError
-        The path is missing, or not a file (reading a pipe would block).
+        The path is missing, or not a file (reading a pipe would block), or not text.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file")
@@ -104,26 +102,61 @@ def blocks(path: Path) -> Iterator[Block]:
             raise InputError(f"{path}: is {'a folder' if path.is_dir() else 'a device'}, not a file")
         file = opened(path)
     with file:
-        first, pieces = 1, [_read(path, file).removeprefix(BOM)]
-        if WIDE.match(pieces[0]):
+        data = _read(path, file).removeprefix(BOM)
+        rest = [b""]
+        first = 1
+        if WIDE.match(data):
             raise InputError(f"{path}: is text in UTF-16, as PowerShell and Excel write it; save it as UTF-8")
-        while pieces[-1]:
+        while data:
             require_room(path, file.tell())
-            head, end, tail = pieces[-1].rpartition(b"\n")
+            head, end, tail = data.rpartition(b"\n")
             if end:
-                block = Block(path, b"".join([*pieces[:-1], head, end]), first)
+                block = Block(_lines(path, b"".join([*rest, head, end])), first, ends=True)
                 yield block
-                first, pieces = first + block.count, [tail]
-            pieces.append(_read(path, file))
-    if last := b"".join(pieces):
-        yield Block(path, last, first, ends=False)
+                first += len(block.rows)
+                rest = []
+            rest.append(tail)
+            data = _read(path, file)
+    if last := b"".join(rest):
+        yield Block(_lines(path, last), first, ends=False)
+
+
+def _lines(path: Path, data: bytes) -> list[str]:
+    with reading(path, REFUSAL):
+        return data.decode("utf-8").splitlines()
+
+
+def line_of(path: Path, wanted: int) -> str:
+    """A line by its number."""
+    lines = itertools.chain.from_iterable(block.lines() for block in blocks(path))
+    return next(line for number, line in lines if number == wanted)
 
 
 def opened(path: Path) -> BinaryIO:
     """A file for reading, unpacked where its name ends in .gz."""
-    return cast(BinaryIO, gzip.open(path, "rb")) if path.suffix.lower() == ".gz" else path.open("rb")
+    if path.suffix.lower() == ".gz":
+        return cast(BinaryIO, gzip.open(path, "rb"))
+    return path.open("rb")
 
 
 def _read(path: Path, file: BinaryIO) -> bytes:
     with reading(path, REFUSAL):
         return file.read(BLOCK)
+
+
+class FileRows:
+    """Rows of a file, each with its place."""
+
+    path: Path
+    line: Indices  # (N,)
+    unit: str  # of these numbers: line, row, message
+    open_line: int  # line of the last row if it has no end, and may be cut short; 0 otherwise
+
+    def place(self, row: int) -> str:
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def open_end(self, row: int = -1) -> str:
+        """What to note of a row if it is cut short; "" where its line has an end."""
+        if not self.open_line or self.line[row] != self.open_line:
+            return ""
+        return cut_note(self.path, self.open_line)

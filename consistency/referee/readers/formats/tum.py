@@ -1,4 +1,4 @@
-"""TUM trajectories: lines ``t tx ty tz qx qy qz qw``, the covariances in the same line or in a file of their own."""
+"""Trajectories in space, as text in files for estimates, truth and covariances, or as messages of a bag."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
-from consistency.referee.readers.clock_units import nothing_near
+from consistency.referee.geometry.conventions import INERTIAL, PLANAR
+from consistency.referee.readers.formats import pose_covariances as stated_as
 from consistency.referee.readers.formats.column_renaming import Columns
-from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.readers.formats.named_columns import numbered
+from consistency.referee.readers.formats.number_lines import Lines
+from consistency.referee.readers.formats.pose_covariances import ORDERS
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
     DEVIATIONS_LAYOUT,
@@ -27,7 +26,6 @@ from consistency.referee.readers.formats.pose_rows import (
     POINT,
     POSE,
     SPLIT,
-    TRIANGLE,
     States,
     read_beside,
     read_deviations,
@@ -40,8 +38,8 @@ from consistency.referee.readers.formats.position_truth import (
     positions,
     require_positions,
 )
-from consistency.referee.readers.formats.sheet import Lines, read_numbers
-from consistency.referee.readers.options import COLUMNS, Reading
+from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
@@ -54,15 +52,11 @@ from consistency.referee.readers.truth_matching import (
     Estimator,
     Poses,
     Stated,
-    associate,
     unstated,
 )
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
-ORDERS = ("translation-rotation", "rotation-translation")
-BLOCKS_OF_STATE = ("p", "R", "v", "bg", "ba")  # three components each, in the order of STATE
-BOTH = 2 * FULL  # and a cross-covariance with the line before
-UNIT = 1e-3  # quaternions of four decimals pass
+OPENVINS = "written by OpenVINS"
 
 
 @dataclass(frozen=True)
@@ -89,14 +83,19 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     ----------
     poses_alone : covariances are not looked at
     """
-    if r.error not in (None, *INERTIAL):
-        raise InputError(f"--error {r.error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+    stated_as.require_spatial(r.error, INERTIAL)
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
     runs = (SpaceRun(read_trajectory(own, columns=r.columns), truth_of(true), (own, true), P) for own, true, P in files)
-    if poses_alone:
-        return [poses_of(estimates, runs, r)]
-    return [space_estimator(estimates, runs, r)]
+    return [poses_of(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
+
+
+class Layout(NamedTuple):
+    """What the files of all runs have in common."""
+
+    stated: Stated
+    convention: str  # of the error of poses; "" of positions by satellite
+    files: tuple[Path | str, Path | str]  # of the first run
 
 
 def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str = "", mixed: str = "") -> Estimator:
@@ -107,7 +106,6 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     why : reason for the default error, as the end of a note; that of the layout where empty
     mixed : message where runs are of different layouts
     """
-    arm = r.lever_arm or (0.0, 0.0, 0.0)
     poses: list[Poses] = []
     notes: list[str] = []
     layout: Layout | None = None
@@ -116,26 +114,20 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
         if layout is None:
             layout = _layout_of(own, run.files, r)
-            notes += _order_note(run.files[0], _width(own), r)
+            notes.append(stated_as.order_note(run.files[0], stated_as.components_of(own), r))
         elif _stated(own) != layout.stated:
             what = f"{run.files[0]}: has {own.values.shape[1]} columns, {layout.files[0]} another layout"
             raise InputError(mixed or what)
-        if isinstance(own, Fixes):
-            one = fixed(own, true, r, _of_truth(true, own, ORDERS[0], r))
-        else:
-            k, unjudged = judged_rest(own, true, r)
-            notes.append(unjudged)
-            one = _poses(own, true, run.covariance, layout.convention, r, k)
-            if _is_point(true):
-                one = positions(one, arm, layout.stated != WHOLE)
-        poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end))
+        one, unjudged = _beside_truth(replace(run, own=own, true=true), layout, r)
+        notes.append(unjudged)
+        poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end()))
     assert layout is not None
     if poses[0].manifold == "spatial" and r.axes is None and r.relative is None:
-        empty, what = placeholder(poses)
+        is_empty, what = placeholder(poses)
         if what:
             notes.append(f"{layout.files[1]}: {what}")
-        if empty:
-            poses = [positions(one, arm, layout.stated != WHOLE) for one in poses]
+        if is_empty:
+            poses = [positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
         require_positions(path, poses, r)
     elif r.lever_arm is not None:
@@ -148,19 +140,12 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         why = ""
     elif not why:
         why = f"; the default of this layout, {_origin(layout.stated)}"
+    definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
+    axes = STATE[: poses[0].covariance.shape[-1]]
     return Estimator(
-        path.stem, path, poses, STATE[: poses[0].covariance.shape[-1]], kind,
-        f"{INERTIAL.get(kind) or PLANAR[kind]}{why}", layout.stated, path.name, r.covariance,
+        path.stem, path, poses, axes, kind, definition, layout.stated, path.name, r.covariance,
         one_of_each_kind(notes), in_space=True, position=3,
     )  # fmt: skip
-
-
-class Layout(NamedTuple):
-    """What the files of all runs have in common."""
-
-    stated: Stated
-    convention: str  # of the error of poses; "" of positions by satellite
-    files: tuple[Path | str, Path | str]  # of the first run
 
 
 def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
@@ -172,12 +157,36 @@ def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> 
         An option does not go with it.
     """
     stated = _stated(own)
-    require_error(own, r.error)
+    stated_as.require_error(own, r.error)
     if stated not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
-        raise InputError(f"--covariance-order: {files[0]} is written by OpenVINS, rotation before translation")
+        raise InputError(f"--covariance-order: {files[0]} is {OPENVINS}, rotation before translation")
     if isinstance(own, Fixes):
         return Layout(stated, "", files)
-    return Layout(stated, r.error or ("so3" if stated in (WHOLE, ALONE) else "so3-body"), files)
+    default = "so3" if stated in (WHOLE, ALONE) else "so3-body"
+    return Layout(stated, r.error or default, files)
+
+
+def _stated(own: Lines) -> Stated:
+    """Components whose covariance is known, by the layout of a file."""
+    width = own.values.shape[1]
+    if isinstance(own, Fixes):
+        return ALONE if own.alone else POINTS
+    if isinstance(own, States):
+        return SINGLE
+    if width - POSE in DEVIATIONS:
+        return ALONE
+    return BLOCKS if width == SPLIT else WHOLE
+
+
+def _origin(stated: Stated) -> str:
+    """Where a layout of covariances comes from."""
+    if stated in (WHOLE, ALONE):
+        return "as in ROS messages with a covariance; declare yours with --error"
+    if stated == POINTS:
+        return "positions alone"
+    if stated == BLOCKS:
+        return f"{OPENVINS}; --error so3 where it comes from another ROS topic"
+    return OPENVINS
 
 
 def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
@@ -188,12 +197,14 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
     InputError
         A file holds positions alone.
     """
-    poses, pose = [], slice(1, POSE)
+    poses = []
+    pose = slice(1, POSE)
     for run in runs:
-        for lines, name in zip((run.own, run.true), run.files, strict=True):
+        own = run.own
+        true = run.true
+        for lines, name in zip((own, true), run.files, strict=True):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        own, true = run.own, run.true
         place = Places(own.place, np.arange(len(own.t)))
         poses.append(
             Poses(
@@ -202,6 +213,110 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
             )
         )  # fmt: skip
     return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
+
+
+# --- a run with its truth ----------------------------------------------------------------------------
+
+
+def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str]:
+    """The poses of a run, or positions where these alone have a truth, and a note on what is not judged."""
+    own = run.own
+    true = run.true
+    if isinstance(own, Fixes):
+        return fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), ""
+    k, note = judged_rest(own, true, r)
+    order = r.covariance_order or ORDERS[0]
+    P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
+    of_truth = _of_truth(true, own, order, r)
+    own = own.of(slice(0, POSE))
+    poses = Poses(
+        Places(own.place, np.arange(len(own.t))), own.t, _states(own, k), P, known, true.t, _states(true, k), "spatial",
+        layout.convention, r.tolerance, cross, of_truth,
+    )  # fmt: skip
+    if _is_point(true):
+        poses = positions(poses, r.lever_arm, layout.stated != WHOLE)
+    return poses, note
+
+
+def _covariances(
+    own: Lines, path: Path | None, n: int, order: str, tolerance: float
+) -> tuple[Array, Array, Array | None]:
+    """Covariances (N, n, n), NaN where none is near, whether there is one, (N,), and cross-covariances.
+
+    They stand in the lines or in a file of their own.
+    """
+    P = stated_as.covariances_in(own, order)
+    if path is None and P is not None:
+        return symmetric(P[:, :n, :n], own.place, one_triangle=True), np.ones(len(P), bool), None
+    if path is None:
+        of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
+        if isinstance(own, States):
+            of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
+        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
+    if P is not None:
+        raise InputError(f"--covariance {path}: {own.path} holds covariances already; give one of them")
+    if isinstance(own, States):
+        source, P = read_deviations(path)
+    else:
+        source = stated_as.read_covariances(path)
+        P = stated_as.matrices_of(source, order)
+    rows, picked = stated_as.nearest_rows(own, source, tolerance)
+    known = np.zeros(len(own.t), bool)
+    known[rows] = True
+    cross = None
+    if source.values.shape[1] == 1 + stated_as.BOTH:
+        cross = stated_as.cross_covariances(own, source, rows, picked, order)
+    return stated_as.on_rows(len(known), rows, P[picked][:, :n, :n], source, picked), known, cross
+
+
+def _states(lines: Lines, k: int) -> Array:
+    """Poses with the first ``k`` numbers of velocity and biases behind them, (N, 7 + k)."""
+    pose = lines.values[:, 1:POSE]
+    if lines.rest is None or not k:
+        return pose
+    return np.column_stack([pose, lines.rest[:, :k]])
+
+
+def judged_rest(own: Lines, true: Lines, r: Reading) -> tuple[int, str]:
+    """How many numbers of velocity and biases are judged beside the poses, and a note where they are not."""
+    stated = 9 if isinstance(own, States) else stated_as.components_of(own) - 6
+    k = stated
+    for lines in (own, true):
+        k = min(k, 0 if lines.rest is None else lines.rest.shape[1])
+    moving = r.given(("relative", "align", "truth_covariance"))
+    if k and moving:
+        flag = flag_of(moving[0])
+        return 0, f"{own.path}: with {flag} the poses alone are judged, not their velocities and biases"
+    if k == stated or isinstance(own, States):
+        return k, ""
+    what = "biases" if k else "velocities"
+    return k, f"{true.path}: holds no {what}, so that those of {own.path} are not judged"
+
+
+def _unused(truth: Lines, r: Reading) -> str:
+    """A note on a covariance of the truth that nothing is done with, "" without one."""
+    stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE:] > 0).any())
+    if r.truth_covariance is not None or not stated or isinstance(truth, States):
+        return ""
+    return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
+
+
+def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
+    """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3): of its columns, or of a file; NaN without one."""
+    if r.truth_covariance is None:
+        return None
+    if r.truth_covariance != COLUMNS:
+        path = Path(r.truth_covariance)
+        if path.is_dir():
+            path = _same_stem(path, own.path, "--truth-covariance")
+        return stated_as.from_file(truth, path, order, r.tolerance)
+    P = truth.covariances if isinstance(truth, Fixes) else stated_as.covariances_in(truth, order)
+    if P is None:
+        raise InputError(f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers")
+    return symmetric(P[:, :6, :6], truth.place, one_triangle=True)
+
+
+# --- files -------------------------------------------------------------------------------------------
 
 
 def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
@@ -219,33 +334,6 @@ def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
     return read
 
 
-def _is_point(lines: Lines) -> bool:
-    return lines.values.shape[1] == POINT or isinstance(lines, Fixes)
-
-
-def _stated(own: Lines) -> Stated:
-    """Components whose covariance is known, by the layout of a file."""
-    if isinstance(own, Fixes):
-        return ALONE if own.alone else POINTS
-    if isinstance(own, States):
-        return SINGLE
-    width = own.values.shape[1]
-    if width == SPLIT:
-        return BLOCKS
-    return ALONE if width - POSE in DEVIATIONS else WHOLE
-
-
-def _origin(stated: Stated) -> str:
-    """Where a layout of covariances comes from."""
-    if stated in (WHOLE, ALONE):
-        return "as in ROS messages with a covariance; declare yours with --error"
-    if stated == POINTS:
-        return "positions alone"
-    if stated == BLOCKS:
-        return "written by OpenVINS; --error so3 where it comes from another ROS topic"
-    return "written by OpenVINS"
-
-
 def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
     """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
     truth = r.truth
@@ -258,16 +346,18 @@ def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[
     if not files:
         raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
     stems = [path.stem for path in files]
-    if twice := next((path for path in files if stems.count(path.stem) > 1), None):
-        raise InputError(f"{estimates}: holds the run '{twice.stem}' twice, as .txt and .tum; keep one of them")
+    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
     if covariance is not None and not covariance.is_dir():
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
     out = []
     for path in files:
         own_truth = truth or path
+        own_covariance = covariance
         if truth is not None and truth.is_dir() and not is_drive(truth):
             own_truth = _same_stem(truth, path, "--truth")
-        own_covariance = None if covariance is None else _same_stem(covariance, path, "--covariance")
+        if covariance is not None:
+            own_covariance = _same_stem(covariance, path, "--covariance")
         out.append((path, own_truth, own_covariance))
     return out
 
@@ -275,142 +365,11 @@ def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[
 def _same_stem(folder: Path, path: Path, option: str) -> Path:
     if is_drive(folder / path.stem):
         return folder / path.stem
-    matches = [other for other in (*trajectory_files(folder), *table_files(folder)) if other.stem == path.stem]
-    if not matches:
-        raise InputError(
-            f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum, or table, for {path}; files of the two "
-            "folders are paired by name"
-        )
-    return matches[0]
-
-
-def _poses(
-    own: Lines,
-    truth: Lines,
-    covariance_path: Path | None,
-    convention: str,
-    r: Reading,
-    k: int,
-) -> Poses:
-    """A run with its truth, of poses and ``k`` numbers of velocity and biases; P is NaN where none is near."""
-    order, tolerance = r.covariance_order or ORDERS[0], r.tolerance
-    covariance, source, cross = _inline(own, order), own, None
-    rows = picked = np.arange(len(own.t))
-    if covariance_path is not None:
-        if covariance is not None:
-            raise InputError(f"--covariance {covariance_path}: {own.path} holds covariances already; give one of them")
-        if isinstance(own, States):
-            source, covariance = read_deviations(covariance_path)
-        else:
-            source = read_covariances(covariance_path)
-            covariance = _matrices(source.values[:, 1 : 1 + FULL], order)
-        rows, picked = _pairs(own, source, tolerance, "covariance")
-        if source.values.shape[1] == 1 + BOTH:
-            cross = _cross(own, source, rows, picked, order)
-    if covariance is None:
-        of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
-        if isinstance(own, States):
-            of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
-        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
-    covariance = covariance[:, : 6 + k, : 6 + k]
-    P = np.full((len(own.t), 6 + k, 6 + k), np.nan)
-    if source is not own:
-        covariance = covariance[picked]
-    P[rows] = symmetric(covariance, lambda row: source.place(int(picked[row])), one_triangle=True)
-    with_P = np.zeros(len(own.t), bool)
-    with_P[rows] = True
-    of_truth = _of_truth(truth, own, order, r)
-    own = own.of(slice(0, POSE))
-    place = Places(own.place, np.arange(len(own.t)))
-    return Poses(
-        place, own.t, _states(own, k), P, with_P, truth.t, _states(truth, k), "spatial", convention, tolerance, cross,
-        of_truth,
-    )  # fmt: skip
-
-
-def _states(lines: Lines, k: int) -> Array:
-    """Poses with the first ``k`` numbers of velocity and biases behind them, (N, 7 + k)."""
-    pose = lines.values[:, 1:POSE]
-    if lines.rest is None or not k:
-        return pose
-    return np.column_stack([pose, lines.rest[:, :k]])
-
-
-def _width(lines: Lines) -> int:
-    """Components whose covariance or deviations stand behind the poses."""
-    stated = lines.values.shape[1] - POSE
-    return next((n for n in DEVIATIONS if stated in (n, n * n, n * (n + 1) // 2)), 6)
-
-
-def require_error(own: Lines, error: str | None) -> None:
-    """Refuse covariances of states whose error is not declared, and an error of states for poses alone."""
-    if _width(own) > 6 and error is None:
-        what = f"{own.path}: holds a covariance of poses with their velocity, whose error is not known"
-        raise InputError(f"{what}; add --error {', '.join(INERTIAL)} ('guess' is for poses alone)")
-    if _width(own) == 6 and error not in (None, *SPATIAL):
-        raise InputError(f"--error {error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
-
-
-def judged_rest(own: Lines, true: Lines, r: Reading) -> tuple[int, str]:
-    """How many numbers of velocity and biases are judged beside the poses, and a note where they are not."""
-    stated = 9 if isinstance(own, States) else _width(own) - 6
-    k = min(stated, *(0 if lines.rest is None else lines.rest.shape[1] for lines in (own, true)))
-    moving = {"--relative": r.relative, "--align": r.align, "--truth-covariance": r.truth_covariance}
-    options = [option for option, value in moving.items() if value is not None]
-    if k and options:
-        return 0, f"{own.path}: with {options[0]} the poses alone are judged, not their velocities and biases"
-    if k < stated and not isinstance(own, States):
-        what = "biases" if k else "velocities"
-        return k, f"{true.path}: holds no {what}, so that those of {own.path} are not judged"
-    return k, ""
-
-
-def _unused(truth: Lines, r: Reading) -> str:
-    """A note on a covariance of the truth that nothing is done with, "" without one."""
-    stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE:] > 0).any())
-    if r.truth_covariance is not None or not stated or isinstance(truth, States):
-        return ""
-    return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
-
-
-def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
-    """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3): of its columns, or of a file; NaN without one."""
-    if r.truth_covariance is None:
-        return None
-    if r.truth_covariance == COLUMNS:
-        P = truth.values[:, 4:].reshape(-1, 3, 3) if isinstance(truth, Fixes) else _inline(truth, order)
-        if P is None:
-            raise InputError(
-                f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers"
-            )
-        return symmetric(P[:, :6, :6], truth.place, one_triangle=True)
-    path = Path(r.truth_covariance)
-    source = read_covariances(_same_stem(path, own.path, "--truth-covariance") if path.is_dir() else path)
-    rows, picked = _pairs(truth, source, r.tolerance, "covariance")
-    out = np.full((len(truth.t), 6, 6), np.nan)
-    P = _matrices(source.values[picked, 1 : 1 + FULL], order)
-    out[rows] = symmetric(P, lambda row: source.place(int(picked[row])), one_triangle=True)
-    return out
-
-
-def _cross(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
-    """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
-    what = "but the cross-covariance of the next line is with this one; give each line its pose"
-    gap = np.diff(picked) != 1
-    refuse(gap, lambda row: source.place(int(picked[row]) + 1), f"no pose of {own.path} has this time, {what}")
-    out = np.full((len(own.t), 6, 6), np.nan)
-    out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
-    return out
-
-
-def _pairs(own: Lines, other: Lines, tolerance: float, what: str) -> tuple[Indices, Indices]:
-    rows, match = associate(own.t, other.t, tolerance)
-    if not len(rows):
-        raise nothing_near((own.path, other.path), own.t, other.t, tolerance, "estimate", what)
-    return rows, match
-
-
-# --- files ---------------------------------------------------------------------------------------
+    for other in (*trajectory_files(folder), *table_files(folder)):
+        if other.stem == path.stem:
+            return other
+    what = f"holds no file '{path.stem}' with .txt or .tum, or table, for {path}"
+    raise InputError(f"{option} {folder}: {what}; files of the two folders are paired by name")
 
 
 def read_trajectory(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
@@ -421,85 +380,19 @@ def read_trajectory(path: Path, true: bool = False, columns: Columns | None = No
 def _checked(lines: Lines, true: bool = True) -> Lines:
     """Poses whose quaternions have unit length, and which are finite if they are a truth."""
     pose = lines.values[:, 1:POSE]
-    finite = np.isfinite(pose).all(axis=1)
     if true:
-        refuse(~finite, lines.place, "the truth is not finite; leave such lines out")
+        refuse(~np.isfinite(pose).all(axis=1), lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):
         return lines
-    length = np.linalg.norm(pose[:, 3:], axis=1)
-    bad = finite & (np.abs(length - 1.0) > UNIT)
+    bad, length = not_unit(pose)
     whole = lines.without_cut(bad)
     if whole is not lines:
         return whole
-    columns = f"columns {'2 to 5' if isinstance(lines, States) else '5 to 8'} must be qx qy qz qw"
-    where = lines.note.partition(": ")[2] or columns
+    places = "2 to 5" if isinstance(lines, States) else "5 to 8"
+    where = lines.note.partition(": ")[2] or f"columns {places} must be qx qy qz qw"
     refuse(bad, lines.place, lambda row: f"the quaternion has length {length[row]:.4g}, not 1; {where}")
     return lines
 
 
-def read_covariances(path: Path) -> Lines:
-    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle.
-
-    72 numbers are the 36 and the cross-covariance E e_before e' with the line before, row by row.
-    """
-    widths, layout = (1 + TRIANGLE, 1 + FULL, 1 + BOTH), f"t and {FULL} numbers, or t and {TRIANGLE}, or t and {BOTH}"
-    return read_numbers(path, widths, layout)
-
-
-def _inline(own: Lines, order: str) -> Array | None:
-    numbers = own.values[:, POSE:]
-    if not numbers.shape[1]:
-        return None
-    if numbers.shape[1] in DEVIATIONS:
-        return diagonal(numbers[:, covariance_order(numbers.shape[1], order)])
-    if own.values.shape[1] == SPLIT:  # rotation, then position
-        rotation, position = _triangle(numbers[:, :6], 3), _triangle(numbers[:, 6:], 3)
-        out = np.zeros((len(numbers), 6, 6))
-        out[:, :3, :3], out[:, 3:, 3:] = position, rotation
-        return out
-    return _matrices(numbers, order)
-
-
-def _matrices(numbers: Array, order: str) -> Array:
-    """(N, n^2) or its upper triangle -> (N, n, n), translation first; n is 6, 9 or 15."""
-    n = next(n for n in DEVIATIONS if numbers.shape[1] in (n * n, n * (n + 1) // 2))
-    P = numbers.reshape(-1, n, n) if numbers.shape[1] == n * n else _triangle(numbers, n)
-    if order != ORDERS[0]:
-        P = P[:, covariance_order(n, order)][:, :, covariance_order(n, order)]
-    return np.asarray(P)
-
-
-def covariance_order(n: int, order: str) -> list[int]:
-    """Places of x, y, z, the rotation and n - 6 more among components in an order."""
-    there = BLOCKS_OF_STATE[: n // 3]
-    blocks = [block for block in blocks_in(n, order) if block in there]
-    return [3 * blocks.index(block) + i for block in there for i in range(3)]
-
-
-def blocks_in(n: int, order: str) -> list[str]:
-    """Blocks of a covariance (n, n) in an order, which may leave out the last ones."""
-    names = {ORDERS[0]: "p,R", ORDERS[1]: "R,p"}.get(order, order).split(",")
-    return [*names, *(block for block in BLOCKS_OF_STATE[: n // 3] if block not in names)]
-
-
-def _order_note(path: Path | str, n: int, r: Reading) -> list[str]:
-    """The order of the blocks: where it is declared, or where no names of columns tell that of three or more."""
-    order = r.covariance_order
-    blocks, there = blocks_in(n, order or ORDERS[0]), BLOCKS_OF_STATE[: n // 3]
-    if sorted(blocks) != sorted(there):
-        blocks_of_file = f"the blocks {','.join(there)} of {path} in their order, such as {','.join(reversed(there))}"
-        raise InputError(
-            f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {blocks_of_file} "
-            "(p position, R rotation, v velocity, bg, ba biases)"
-        )
-    head = None if n == 6 or order else head_of(Path(path), r.columns)
-    if order is None and (n == 6 or (head is not None and not any(map(numbered, head.names)))):
-        return []
-    return [f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"]
-
-
-def _triangle(numbers: Array, n: int) -> Array:
-    out = np.empty((len(numbers), n, n))
-    i, j = np.triu_indices(n)
-    out[:, i, j] = out[:, j, i] = numbers
-    return out
+def _is_point(lines: Lines) -> bool:
+    return lines.values.shape[1] == POINT or isinstance(lines, Fixes)

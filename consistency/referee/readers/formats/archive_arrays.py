@@ -1,0 +1,186 @@
+"""Arrays of an archive by key, (runs, steps, ...), and their checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.groups import on_steps
+from consistency.referee.diagnostics.records.record import numbered_axes
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import is_file, reading, require_name, require_room
+from consistency.referee.readers.formats.number_lines import bounded
+from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof
+from consistency.referee.readers.options import Reading
+from consistency.referee.types import Array
+
+KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
+
+
+def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
+    """All arrays of an archive by key, of any shape; ``keys`` says in messages which it should hold.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or not an archive of arrays.
+    """
+    if not is_file(path):
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    if path.suffix.lower() == ".mat":
+        from consistency.referee.readers.formats.matlab_file import load_matlab
+
+        return load_matlab(path)
+    with path.open("rb") as file:
+        what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
+    refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
+    with reading(path, refusal), np.load(path, allow_pickle=False) as archive:
+        if not hasattr(archive, "files"):
+            raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+        if len(set(archive.files)) < len(archive.files):
+            raise ValueError("a key is duplicated")
+        require_room(path, sum(member.file_size for member in archive.zip.infolist()))
+        return {key: _member(path, archive, key) for key in archive.files}
+
+
+def _member(path: Path, archive: Any, key: str) -> Array:
+    try:
+        array: Array = archive[key]
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        what = "holds Python objects, as of runs of different lengths; pad them with NaN and add 'lengths'"
+        raise InputError(f"{path}: key '{key}' {what}") from None
+    return array
+
+
+# --- arrays by key, checked --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Arrays by key; its methods give them checked, and raise :class:`InputError`."""
+
+    path: Path
+    arrays: Mapping[str, Array]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.arrays
+
+    def require_numbers(self, key: str) -> Array:
+        """An array of numbers, of any shape."""
+        array = self.arrays[key]
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{self.path}: key '{key}' holds {array.dtype}, not numbers")
+        return array
+
+    def array(self, key: str, dimensions: int) -> Array:
+        """An array of floats; one run without its dimension gets it."""
+        array = self.require_numbers(key)
+        if array.ndim == dimensions - 1:
+            array = array[None]
+        if array.ndim != dimensions or not array.size:
+            needed = ", ".join(("runs", "steps", "n", "n")[:dimensions])
+            raise InputError(f"{self.path}: key '{key}' has shape {array.shape}, needs ({needed})")
+        return bounded(np.asarray(array, float))
+
+    def matrices(self, key: str, shape: tuple[int, ...]) -> Array:
+        """Matrices of one ``shape``, (runs, steps, n, n)."""
+        matrices = self.array(key, 4)
+        if matrices.shape != shape:
+            turned = _turned(matrices.shape, shape)
+            raise InputError(f"{self.path}: key '{key}' has shape {matrices.shape}, needs {shape}{turned}")
+        return matrices
+
+    def estimates_and_truth(self) -> tuple[Array, Array]:
+        """Both (runs, steps, n)."""
+        estimates = self.array("estimates", 3)
+        truth = self.array("truth", 3)
+        if estimates.shape != truth.shape:
+            turned = _turned(truth.shape, estimates.shape)
+            shapes = f"key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}"
+            raise InputError(f"{self.path}: {shapes}{turned}")
+        return estimates, truth
+
+    def whole_numbers(self, key: str, shape: tuple[int, ...]) -> Array:
+        """Numbers of one key, as many as ``shape``, or one for all."""
+        array = self.require_numbers(key)
+        try:
+            return np.broadcast_to(bounded(np.asarray(array, float)), shape)
+        except ValueError:
+            raise InputError(f"{self.path}: key '{key}' must be one number or of shape {shape}") from None
+
+    def lengths(self, runs: int, steps: int) -> list[int]:
+        """Steps of each run; those of the array ``lengths`` (runs,) where they differ."""
+        if "lengths" not in self:
+            return [steps] * runs
+        lengths = np.atleast_1d(self.arrays["lengths"])
+        if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
+            raise InputError(f"{self.path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
+        return [int(length) for length in lengths]
+
+    def known(self, runs: int, steps: int) -> Array:
+        """Steps that belong to each run and have a truth, (runs, steps) of bool."""
+        known = np.arange(steps) < np.array(self.lengths(runs, steps))[:, None]
+        mask = self.arrays.get("mask", np.zeros((runs, steps), bool))
+        if mask.shape != (runs, steps) or mask.dtype.kind != "b":
+            raise InputError(f"{self.path}: key 'mask' must be truth values of shape {(runs, steps)}")
+        return np.asarray(known & ~mask)
+
+    def nis(self, shape: tuple[int, int]) -> tuple[Array | None, Array | None]:
+        """NIS and its degrees of freedom, (runs, steps); None without any."""
+        if "nis" not in self:
+            return None, None
+        if "nis_dof" not in self:
+            raise InputError(f"{self.path}: key 'nis_dof' is missing; {NIS_DOF}")
+        nis = self.array("nis", 2)
+        if nis.shape != shape:
+            raise InputError(f"{self.path}: key 'nis' has shape {nis.shape}, needs {shape}")
+        dof = self.whole_numbers("nis_dof", shape)
+        known = np.isfinite(nis)
+        if (nis < 0).any() or np.isinf(nis).any() or not are_dof(dof[known]).all():
+            needed = "nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
+            raise InputError(f"{self.path}: keys 'nis', 'nis_dof': {needed}")
+        return nis, np.where(known, dof, 0.0)
+
+    def times(self, steps: int) -> Array:
+        """Key ``t``, (steps,) in s; NaN without it."""
+        if "t" not in self:
+            return np.full(steps, np.nan)
+        t = self.arrays["t"]
+        if t.shape != (steps,) or t.dtype.kind not in "fiu" or not (np.diff(t) > 0).all():
+            raise InputError(f"{self.path}: key 't' must be {steps} increasing numbers, in s")
+        return np.asarray(t, float)
+
+    def axes(self, n: int) -> tuple[str, ...]:
+        """Names of the n components of the error."""
+        if "axes" not in self:
+            return numbered_axes(n)
+        where = f"{self.path}: key 'axes'"
+        axes = tuple(require_name(str(axis), where) for axis in np.atleast_1d(self.arrays["axes"]))
+        if len(axes) != n:
+            raise InputError(f"{where} names {len(axes)} components, the error has {n}")
+        return axes
+
+    def groups(self, r: Reading, shape: tuple[int, ...]) -> Array | None:
+        """Cells of the key of ``--by``, (runs, steps); a value for each run stands in all of its steps."""
+        if r.by is None or r.by_file is not None:
+            return None
+        if r.by not in self:
+            there = ", ".join(sorted(self.arrays))
+            raise InputError(f"--by {r.by}: {self.path} has no such key; it holds {there}")
+        try:
+            return on_steps(self.arrays[r.by], shape)
+        except ValueError as error:
+            raise InputError(f"{self.path}: key '{r.by}' {error}") from None
+
+
+def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
+    """What to say where two shapes differ by the order of runs and steps alone."""
+    if found != (needed[1], needed[0], *needed[2:]):
+        return ""
+    return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"

@@ -16,7 +16,7 @@ from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current
 
 
 @dataclass(frozen=True)
-class Look:
+class GateResult:
     """A verdict or a comparison at one false-alarm rate."""
 
     bad: bool
@@ -39,7 +39,7 @@ def marker_text(dof: int, runs: int) -> str:
     )
 
 
-def deciding_runs(result: Look, runs: int) -> int:
+def runs_to_decide(result: GateResult, runs: int) -> int:
     """Number of runs that would probably decide, above the present one; 0 for a comparison, which gives its own."""
     if result.verdict is None:
         return 0
@@ -49,7 +49,7 @@ def deciding_runs(result: Look, runs: int) -> int:
 
 
 def entry_of(
-    gate: str, record: Record, demand: Terms, result: Look, late: Look | None, outcome: str, least: int
+    gate: str, record: Record, demand: Terms, result: GateResult, late: GateResult | None, outcome: str, least: int
 ) -> Entry:
     statistics = result.verdict.statistics if result.verdict is not None else {}
     fields = summary_of(result)
@@ -68,7 +68,7 @@ def entry_of(
     )  # fmt: skip
 
 
-def summary_of(look: Look) -> dict[str, Any]:
+def summary_of(look: GateResult) -> dict[str, Any]:
     summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
     if look.comparison is not None:
         return summary | {"statistic": plain(look.comparison.differences[0].a)}

@@ -154,7 +154,7 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
     return Compared(of_a, of_b, comparison, failures, sources=(a.name, b.name))
 
 
-def document(compared: Sequence[Compared]) -> Document:
+def comparison_document(compared: Sequence[Compared]) -> Document:
     blocks: list[Block] = []
     for each in compared:
         blocks += [comparison_table(*each.names, each.comparison), Text(each.sentence), Text("")]

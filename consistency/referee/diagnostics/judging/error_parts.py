@@ -38,9 +38,9 @@ from consistency.referee.diagnostics.verdict.answers import (
 from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
     Answer,
-    Axes,
     Bias,
     ByGroup,
+    ComponentRatios,
     Equivalence,
     ErrorParts,
     Group,
@@ -152,7 +152,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
     )
 
 
-def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
+def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
     """Inflation of each component and group, since the fault began."""
     errors = sample.known_errors
     late, confidence = from_step(location.since), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
@@ -160,8 +160,8 @@ def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
     for key, index in errors.groups.items():
         inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
     if tests.largest is None:
-        return Axes(errors.names, errors.groups, inflation)
-    return Axes(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
+        return ComponentRatios(errors.names, errors.groups, inflation)
+    return ComponentRatios(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
 
 
 def by_group_of(

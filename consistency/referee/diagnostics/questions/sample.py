@@ -22,7 +22,7 @@ POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
 
 
 @dataclass(frozen=True)
-class Errors:
+class ComponentErrors:
     """Whitened errors of a record and the names of their components; N runs, T steps, n components."""
 
     record: Record  # with errors and covariances
@@ -75,11 +75,11 @@ class Sample:
 
     nees: Array  # (N, T), NaN where nothing counts
     dof: int
-    errors: Errors | None = None
+    errors: ComponentErrors | None = None
     groups: Groups | None = None
 
     @property
-    def known_errors(self) -> Errors:
+    def known_errors(self) -> ComponentErrors:
         """Errors of a sample that has them."""
         assert self.errors is not None
         return self.errors
@@ -174,7 +174,7 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups), record.groups)
+    return Sample(nees, error.shape[-1], ComponentErrors(record, whitened, names, groups), record.groups)
 
 
 def names_of(record: Record) -> tuple[str, ...]:

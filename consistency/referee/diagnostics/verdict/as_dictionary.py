@@ -9,9 +9,9 @@ import numpy as np
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
-    Axes,
     Bias,
     ByGroup,
+    ComponentRatios,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -97,7 +97,7 @@ def location_numbers(location: Location | None) -> Numbers:
     }
 
 
-def axes_numbers(axes: Axes) -> Numbers:
+def axes_numbers(axes: ComponentRatios) -> Numbers:
     return {
         "axes": axes.names,
         "groups": {key: list(index) for key, index in axes.groups.items()},

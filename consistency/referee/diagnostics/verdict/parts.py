@@ -104,7 +104,7 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Axes:
+class ComponentRatios:
     """The error by component; n components."""
 
     names: tuple[str, ...]
@@ -330,7 +330,7 @@ class ErrorParts(NamedTuple):
 
     scale: Scale | None = None
     location: Location | None = None
-    axes: Axes | None = None
+    axes: ComponentRatios | None = None
     bias: Bias | None = None
     shape: Shape | None = None
     tails: Tails | None = None

@@ -17,9 +17,9 @@ from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
     Answer,
-    Axes,
     Bias,
     ByGroup,
+    ComponentRatios,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -53,7 +53,7 @@ class Findings:
     impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
     left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
     scale: Scale | None = None
-    axes: Axes | None = None
+    axes: ComponentRatios | None = None
     bias: Bias | None = None
     shape: Shape | None = None
     tails: Tails | None = None

@@ -18,7 +18,16 @@ from consistency.referee.diagnostics.questions.shape import weighted_chi_square_
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, Settings, at_share, least_of_steps
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    BIAS,
+    MAIN,
+    SHARES,
+    Settings,
+    at_share,
+    faults_of,
+    least_of_steps,
+)
 from consistency.referee.diagnostics.verdict.parts import Answer, Equivalence, ErrorParts, Interval, TruthShare
 from consistency.referee.types import Array
 
@@ -263,7 +272,7 @@ class UncertainTruth:
 
     def status(self, status: str, answers: Sequence[Answer], settings: Settings) -> str:
         """The status: where only bounds hold, by the side of what they found."""
-        faults = {answer.question for answer in answers if answer.found and not answer.tolerated}
+        faults = set(faults_of(answers))
         if not self.bounded or not faults & {MAIN, AXIS, *BIAS} or status == "heavy-tailed":
             return status
         if faults & set(BIAS):

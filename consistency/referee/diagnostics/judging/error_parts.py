@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.fault_location import Answers, any_found, from_step, location_of
+from consistency.referee.diagnostics.judging.fault_location import from_step, location_of
 from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
 from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import hotelling
@@ -33,6 +33,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     STEP,
     Settings,
     at_share,
+    faults_of,
     with_tolerated,
 )
 from consistency.referee.diagnostics.verdict.parts import (
@@ -61,7 +62,7 @@ def error_parts(
     record: Record, sample: Sample, tests: Tests, given: Sequence[Answer], settings: Settings, shown: Equivalence
 ) -> ErrorParts:
     """All parts of the errors of a sample; those of NEES alone have no components."""
-    faults = {answer.question: answer for answer in given if not answer.tolerated}
+    faults = set(faults_of(given))
     band = _band_of_fault(sample, tests, faults, settings)
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
@@ -81,10 +82,9 @@ def error_parts(
     )
 
 
-def _band_of_fault(sample: Sample, tests: Tests, faults: Answers, settings: Settings) -> Band:
+def _band_of_fault(sample: Sample, tests: Tests, faults: set[str], settings: Settings) -> Band:
     """The band of the steps; where they were found by what Holm's correction left over, one that shows it."""
-    step = faults.get(STEP)
-    if step is None or not step.found or tests.band.outside.any():
+    if STEP not in faults or tests.band.outside.any():
         return tests.band
     rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
     return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
@@ -177,8 +177,7 @@ def by_group_of(
         return None
     found = [sample.in_group(number) for number in range(len(groups.names))]
     there = sum(len(one.means) > 0 for one in found)
-    answer = next((answer for answer in given if answer.question == GROUP), None)
-    is_found = answer is not None and answer.found and not answer.tolerated
+    is_asked, is_found = any(answer.question == GROUP for answer in given), GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
@@ -188,7 +187,7 @@ def by_group_of(
             continue
         shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
         p_value, status = float("nan"), ""
-        if answer is not None:
+        if is_asked:
             p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
             is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
@@ -206,7 +205,7 @@ def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
     return "consistent" if shown.shown else "undecided"
 
 
-def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
+def bias_of(sample: Sample, step: int | None, location: Location, faults: set[str]) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
     errors, late = sample.known_errors, from_step(location.since)
 
@@ -220,7 +219,7 @@ def bias_of(sample: Sample, step: int | None, location: Location, answers: Answe
         test = hotelling(of_runs, CONFIDENCE)
         for i, axis in enumerate(errors.names):
             by_axis[axis] = Interval(test.mean[i], *test.interval[i])
-    if not any_found(answers, BIAS):
+    if not faults & set(BIAS):
         return Bias(by_axis, step, None, None, None)
     without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
     if step is None:
@@ -231,18 +230,18 @@ def bias_of(sample: Sample, step: int | None, location: Location, answers: Answe
     return Bias(by_axis, step, errors.names[chief], float(mean[chief]), without)
 
 
-def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
+def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
     errors, here = sample.known_errors, slice(None)
-    if tests.shape_step is not None and not any_found(answers, ("shape",)):
+    if tests.shape_step is not None and "shape" not in faults:
         here = slice(tests.shape_step - 1, tests.shape_step)
     counted = sample.counted[:, here]
     pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], counted)
     known = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
     opposite = actual * stated < 0.0 and abs(actual) > known and abs(stated) > VISIBLE
-    wrong_sign = any_found(answers, SHAPE) and opposite
+    wrong_sign = bool(faults & set(SHAPE)) and opposite
     right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in errors.names)
     return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
 

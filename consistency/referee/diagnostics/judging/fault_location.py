@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
@@ -12,20 +10,12 @@ from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP, Settings
-from consistency.referee.diagnostics.verdict.parts import Answer, Location, Until
+from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP
+from consistency.referee.diagnostics.verdict.parts import Location, Until
 from consistency.referee.types import Array, Indices
 
-DETECT = Settings().factor
 FEWEST = 8  # runs; with fewer the axes are not told apart
 SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
-
-Answers = Mapping[str, Answer]
-
-
-def any_found(answers: Answers, questions: Collection[str]) -> bool:
-    """Whether one of the questions found a fault."""
-    return any(question in answers and answers[question].found for question in questions)
 
 
 def from_step(since: int | None) -> slice:
@@ -35,25 +25,29 @@ def from_step(since: int | None) -> slice:
     return slice(since - 1, None)
 
 
-def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True, detect: float = DETECT) -> Location:
+def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, detect: float) -> Location:
     """Steps outside the band, beginning or end of the fault, and its axes.
 
-    Without ``ordered`` steps a fault has no beginning or end. ``detect`` is that of the settings.
+    Parameters
+    ----------
+    faults : questions that found one
+    ordered : steps follow each other; otherwise a fault has no beginning or end
+    detect : that of the settings, as a factor above 1
     """
     first_outside = first_step = since = subset = last = None
     lasting = False
     if band.outside.any():
         first = int(np.argmax(band.outside))
         first_outside = first + 1
-        if any_found(answers, (STEP,)):
+        if STEP in faults:
             first_step = first_outside
             if ordered:
                 lasting = _is_lasting(sample, band, first)
             if lasting and _absent_before(sample, first, band.above[first]):
                 since = first_step
-    if sample.errors is not None and any_found(answers, SCALE):
-        subset = chief_axes(sample, from_step(since), any_found(answers, (MAIN,)))
-    if ordered and any_found(answers, (*SCALE, *BIAS)):
+    if sample.errors is not None and faults & set(SCALE):
+        subset = chief_axes(sample, from_step(since), MAIN in faults)
+    if ordered and faults & {*SCALE, *BIAS}:
         last = until(sample, band, detect)
     return Location(
         simultaneous=np.stack([band.low, band.high], axis=-1),

@@ -25,6 +25,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     Settings,
     answers,
     at_share,
+    faults_of,
 )
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
@@ -67,6 +68,13 @@ def status_without_fault(
     return "undecided"
 
 
+def withheld(unshown: str, status: str, scale: Scale | None) -> tuple[str, str, Scale | None]:
+    """Reason, status and scale where nothing can be shown for that reason: undecided, unless a run failed."""
+    if not unshown or scale is None or status == "failed":
+        return "", status, scale
+    return unshown, "undecided", scale.not_shown
+
+
 def few_lost(lost: Lost | None, settings: Settings) -> bool:
     """Whether the share of lost runs is shown to be what was asked for, if it was."""
     if settings.lost is None:
@@ -95,7 +103,7 @@ def status_by_errors(
     parts: ErrorParts,
 ) -> str:
     """The status where a question about errors found a fault. It may overwrite the arrays of the ``sample``."""
-    faults = {answer.question for answer in given if answer.found and not answer.tolerated}
+    faults = set(faults_of(given))
     if faults & set(BIAS):
         sample, tests, rest = _without_bias(given, settings, sample)
         status = "biased"

@@ -159,6 +159,11 @@ def at_share(given: Sequence[Answer], settings: Settings) -> Settings:
     return replace(settings, false_alarm=min(settings.false_alarm * share / SHARES[MAIN], CERTAIN))
 
 
+def faults_of(given: Sequence[Answer]) -> dict[str, Answer]:
+    """Answers that found a fault, those within the tolerance left out, by question."""
+    return {answer.question: answer for answer in given if answer.found and not answer.tolerated}
+
+
 def with_tolerated(given: Sequence[Answer], questions: Collection[str]) -> tuple[Answer, ...]:
     """Answers with the faults in these questions marked as tolerated."""
     return tuple(replace(a, tolerated=a.tolerated or (a.found and a.question in questions)) for a in given)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -101,6 +101,11 @@ class Scale:
     @property
     def judged_steps(self) -> int:
         return int((self.alive > 0).sum())
+
+    @property
+    def not_shown(self) -> Scale:
+        """The same scale where it is shown to be nothing."""
+        return replace(self, equivalence=replace(self.equivalence, p_value=float("nan"), runs=None))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record, shown_by
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
-from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.answers import Settings, faults_of
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
@@ -70,7 +70,9 @@ class Findings:
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
     truth: TruthShare | None = None  # where the truth has a covariance of its own
-    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
+    parts: Mapping[str, Findings] = field(default_factory=dict)  # where cross terms between them are not stated
+    unshown: str = ""  # why nothing can be shown, so that nothing is decided
+    later: bool = False  # nothing is decided at this look, which asks the scale alone and found no fault in it
 
     @property
     def consistent(self) -> bool:
@@ -122,7 +124,7 @@ class Findings:
     @property
     def faults(self) -> tuple[str, ...]:
         """Questions in which a fault was found, those within the tolerance left out."""
-        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
+        return tuple(faults_of(self.answers))
 
     @property
     def p_value(self) -> float:
@@ -212,6 +214,7 @@ class Verdict(Findings):
     ``print`` shows the sentence and a short table.
     """
 
+    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     reasons: tuple[str, ...] = ()  # the first is a sentence to act on
     details: tuple[str, ...] = ()  # of the reasons, those that only --verbose shows on a terminal
     axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does

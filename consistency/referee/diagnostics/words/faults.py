@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Answer, Innovations, Interval, JointScore
+from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
     is_uncertain,
@@ -23,20 +23,19 @@ NOTABLE = 0.3  # difference of correlations that stands out in one step
 MOST = 3  # axes that a sentence names with their figures
 NAMED = 0.1  # part of a unit vector that a sentence names
 
-Faults = Mapping[str, Answer]
 NamedRatio = tuple[str, Interval]
 
 
 # --- the scale ---------------------------------------------------------------------------------------
 
 
-def scale_text(v: Findings, faults: Faults) -> str:
+def scale_text(v: Findings) -> str:
     """Too small or too large a covariance; '' where a correlation of the wrong sign is all that it is."""
     assert v.scale is not None
     assert v.location is not None
     if v.status == "inconsistent" and v.shape is not None and v.shape.alone:
         return ""
-    if (MAIN not in faults and STEP not in faults) or opposite(v, faults):
+    if (MAIN not in v.faults and STEP not in v.faults) or opposite(v):
         return _axes_text(v)
     if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _wrong(v, -1):
         return _correlation_text(v)
@@ -46,14 +45,14 @@ def scale_text(v: Findings, faults: Faults) -> str:
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
-    if MAIN not in faults and (contrary or not v.location.lasting):
+    if MAIN not in v.faults and (contrary or not v.location.lasting):
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
     text = _size_text(v, inflation, about) + _where(v)
     text += _first_visible(v)
-    if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
+    if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
         text += _contrary_axis(v)
     return text
 
@@ -151,9 +150,9 @@ def _steps_text(v: Findings) -> str:
     return f"covariance {', and '.join(parts)}"
 
 
-def opposite(v: Findings, faults: Faults) -> bool:
+def opposite(v: Findings) -> bool:
     """Is the verdict about axes that err in opposite directions?"""
-    return v.status == "inconsistent" and AXIS in faults and bool(_wrong(v, 1)) and bool(_wrong(v, -1))
+    return v.status == "inconsistent" and AXIS in v.faults and bool(_wrong(v, 1)) and bool(_wrong(v, -1))
 
 
 def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
@@ -248,12 +247,12 @@ def _sigmas(value: float) -> str:
     return f"{value:+.1e}"
 
 
-def shape_text(v: Findings, faults: Faults) -> str:
+def shape_text(v: Findings) -> str:
     """The two axes that are correlated least as stated, where it can be seen."""
     assert v.shape is not None
     assert v.axes is not None
     shape, where, worth_a_word = v.shape, "", VISIBLE
-    if "shape" not in faults:
+    if "shape" not in v.faults:
         where, worth_a_word = f" in {v.place(shape.step or 1)}", NOTABLE
     gap = abs(shape.actual - shape.stated)
     if shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
@@ -265,14 +264,14 @@ def shape_text(v: Findings, faults: Faults) -> str:
         if shape.alone:
             text += "; no axis by itself is wrong"
         return text
-    if "shape" in faults:
+    if "shape" in v.faults:
         return f"covariance of the wrong shape{where}"
     return f"covariance of the wrong shape{where}: axes are wrong by different factors"
 
 
-def tails_text(v: Findings, faults: Faults) -> str:
+def tails_text(v: Findings) -> str:
     """The error that stands out, or that runs differ more than they should."""
-    if "outliers" not in faults:
+    if "outliers" not in v.faults:
         return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
     where = v.run_name(v.tails.run)

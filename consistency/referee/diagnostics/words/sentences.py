@@ -15,7 +15,6 @@ from consistency.referee.diagnostics.verdict.parts import Equivalence, Innovatio
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.faults import (
     MOST,
-    Faults,
     bias_text,
     combination_text,
     innovations_text,
@@ -39,56 +38,51 @@ from consistency.referee.diagnostics.words.numbers import (
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are not advice
 MOST_STEPS = 10_000_000  # of a log; more are not advice
-LATER = "no fault found in the scale; the other questions are asked at the next look"
 
 
-def reasons(v: Findings, first: str = "") -> list[str]:
-    """First the sentence, then the figures.
-
-    Parameters
-    ----------
-    first : sentence in place of the first one, which is then not that of the findings
-    """
-    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
-    sentence, figures = _sentence_and_figures(v, faults)
+def reasons(v: Findings) -> list[str]:
+    """First the sentence, then the figures."""
+    sentence, figures = _sentence_and_figures(v)
     lines = [*_failures(v), sentence, *figures]
-    if faults:
+    if v.faults:
         lines = [sentence, *_failures(v), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
     lines += [*details(v), *_first_steps(v)]
-    if not first:
-        first = lines[0]
-        if v.skipped is not None:
-            first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
+    first = lines[0]
+    if v.later:
+        first = "no fault found in the scale; the other questions are asked at the next look"
+    elif v.unshown:
+        first = _unshown_sentence(v)
+    elif v.skipped is not None:
+        first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
     return [f"{v.status}: {first}", *lines[1:]]
 
 
 def details(v: Findings) -> list[str]:
     """Figures that a first reading leaves out: credibility indices, and p values of the questions."""
-    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
     lines = []
     if v.accuracy is not None and np.isfinite(v.accuracy.nci):
         lines.append(
             f"noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB (0 if right)"
         )
     if v.answers:
-        lines.append(_questions(v, faults))
+        lines.append(_questions(v))
     return lines
 
 
-def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
+def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
     """The sentence on errors, or without truth on innovations, and the figures behind it."""
     if v.scale is not None and v.scale.judged_steps:
         figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
         figures += _coverage(v)
-        if faults:
-            return _fault(v, v.scale, faults), figures
+        if v.faults:
+            return _fault(v, v.scale), figures
         return _no_fault(v, v.scale), figures
     if v.scale is not None:
         return "no step has a covariance of full rank to judge", []
     if v.innovations is not None and v.innovations.dof:
-        return _without_truth(v, v.innovations, faults), []
+        return _without_truth(v, v.innovations), []
     return "neither truth nor innovations to judge", []
 
 
@@ -151,45 +145,45 @@ def _first_steps(v: Findings) -> list[str]:
     ]
 
 
-def _fault(v: Findings, s: Scale, faults: Faults) -> str:
+def _fault(v: Findings, s: Scale) -> str:
     """The sentence where a question found a fault."""
     if v.parts:
         return _faults_of_parts(v)
-    of_scale, of_bias = _any_of(SCALE, faults), _any_of(BIAS, faults)
+    of_scale, of_bias = _any_of(SCALE, v.faults), _any_of(BIAS, v.faults)
     is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
     found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
-    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in faults
-    if v.status == "heavy-tailed" or "outliers" in faults or (contrary and not opposite(v, faults)):
-        found.append((tails_text(v, faults), ["outliers"]))
+    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in v.faults
+    if v.status == "heavy-tailed" or "outliers" in v.faults or (contrary and not opposite(v)):
+        found.append((tails_text(v), ["outliers"]))
     if of_bias:
-        found.append((bias_text(v, "bias" not in faults), BIAS))
+        found.append((bias_text(v, "bias" not in v.faults), BIAS))
     if of_scale and v.status not in ("biased", "heavy-tailed"):
-        found.append((scale_text(v, faults), SCALE))
-    if _any_of(SHAPE, faults) and v.status not in ("biased", "heavy-tailed"):
-        found.append((shape_text(v, faults), SHAPE))
-    if JOINT in faults and v.joint is not None and v.status != "heavy-tailed":
+        found.append((scale_text(v), SCALE))
+    if _any_of(SHAPE, v.faults) and v.status not in ("biased", "heavy-tailed"):
+        found.append((shape_text(v), SHAPE))
+    if JOINT in v.faults and v.joint is not None and v.status != "heavy-tailed":
         found.append((joint_text(v, v.joint), [JOINT]))
-    found.sort(key=lambda one: _rank(v, faults, one[1]))
+    found.sort(key=lambda one: _rank(v, one[1]))
     parts = [text for text, _ in found]
     if v.status == "heavy-tailed":
         parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
     if v.by_group is not None:
-        parts.append(groups_text(v.by_group, GROUP in faults))
-    if len(faults) == 1:
-        parts += [ALONE[question] for question in faults if question in ALONE]
-    if "innovation scale" in faults and v.innovations is not None:
+        parts.append(groups_text(v.by_group, GROUP in v.faults))
+    if len(v.faults) == 1:
+        parts += [ALONE[question] for question in v.faults if question in ALONE]
+    if "innovation scale" in v.faults and v.innovations is not None:
         parts.append(innovations_text(v, v.innovations))
-    if "innovation whiteness" in faults:
+    if "innovation whiteness" in v.faults:
         parts.append("innovations correlated over steps")
-    if (of_scale or GROUP in faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
+    if (of_scale or GROUP in v.faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
 
 
-def _rank(v: Findings, faults: Faults, questions: Collection[str]) -> tuple[bool, float, int]:
+def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
     """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
     named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
-    p = min((faults[question].adjusted for question in questions if question in faults), default=1.0)
+    p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
     return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
 
@@ -202,7 +196,7 @@ def _faults_of_parts(v: Findings) -> str:
     texts = []
     for name, part in v.parts.items():
         if part.faults:
-            sentence = part.reasons[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
+            sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
             texts.append(f"{name}: {sentence}")
     if len(texts) > MOST:
         texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
@@ -424,19 +418,19 @@ def _coverage(v: Findings) -> list[str]:
     return [f"2-sigma coverage {', '.join(known)} ({100 * TWO_SIGMA:.1f} % expected)"]
 
 
-def _without_truth(v: Findings, i: Innovations, faults: Faults) -> str:
+def _without_truth(v: Findings, i: Innovations) -> str:
     if not i.judged:
         return (
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
             "filter are neither white nor of the stated size even if it is right"
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
-    if "innovation scale" in faults:
+    if "innovation scale" in v.faults:
         parts.append(innovations_text(v, i, "they are"))
-    if "innovation whiteness" in faults:
+    if "innovation whiteness" in v.faults:
         parts.append("they are correlated over steps")
     shown = i.equivalence
-    if not faults and shown is not None:
+    if not v.faults and shown is not None:
         is_shown = "is not shown to be"
         if shown.shown:
             is_shown = "is shown to be"
@@ -458,14 +452,17 @@ def _nis(i: Innovations) -> str:
     return text
 
 
-def _questions(v: Findings, faults: Faults) -> str:
+def _questions(v: Findings) -> str:
     text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
     if len(v.answers) > 1:
         text += " together"
-    if not faults:
+    if not v.faults:
         least = min(v.answers, key=lambda answer: answer.adjusted)
         return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
-    found = (f"{question_text(v, q)} (p {p_text(answer.adjusted)})" for q, answer in faults.items())
+    found = []
+    for answer in v.answers:
+        if answer.question in v.faults:
+            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
     return f"{text}; found: {', '.join(found)}"
 
 
@@ -479,14 +476,14 @@ def question_text(v: Findings, question: str) -> str:
 # --- where nothing is decided ----------------------------------------------------------------------------
 
 
-def unshown_sentence(found: Findings, why: str) -> str:
+def _unshown_sentence(v: Findings) -> str:
     """Why nothing can be shown, and the ratio that would be judged."""
-    assert found.scale is not None
+    assert v.scale is not None
     provided = " if they are"
-    if found.truth is not None:
+    if v.truth is not None:
         provided = ""
-    ratio = f"the covariance ratio would be {ratio_text(found.scale.inflation)}{provided}, reported and not judged"
-    return f"{why}; {ratio}"
+    ratio = f"the covariance ratio would be {ratio_text(v.scale.inflation)}{provided}, reported and not judged"
+    return f"{v.unshown}; {ratio}"
 
 
 def other_ways(status: str, record: Record) -> list[str]:

@@ -69,13 +69,16 @@ def judge(
     kept = record if keep_record else None
     if record.guesses:
         return _judge_conventions(record, settings, kept)
-    evidence, truth, unshown = record.as_runs, None, record.unshown
+    evidence = record.as_runs
+    truth = None
+    unshown = record.unshown
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
 
         truth = uncertain_truth(record)
     if truth is not None:
-        evidence, unshown = truth.evidence, record.unshown or truth.unjudged
+        evidence = truth.evidence
+        unshown = record.unshown or truth.unjudged
     if evidence.parts:
         from consistency.referee.diagnostics.judging.separate_components import findings_of_parts
 
@@ -105,7 +108,8 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
         sentence = f"{sentence}; {judged.caption}"
     convention = align = None
     if judged.convention:
-        convention, align = judged.convention, judged.align or None
+        convention = judged.convention
+        align = judged.align or None
     left_out = set(found.left_out_steps)
     if judged.align:
         left_out.update(judged.left_out_steps)
@@ -128,7 +132,8 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
         return []
     from consistency.referee.diagnostics.questions.innovations import innovation_causes, nis_and_dof
 
-    innovations, nees_ratio = nis_and_dof(record), float("nan")
+    innovations = nis_and_dof(record)
+    nees_ratio = float("nan")
     if innovations is None:
         return []
     if found.scale is not None:
@@ -148,7 +153,8 @@ def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None
     if settings is None:
         landmarks = landmarks.of_runs(_end_of_runs(record))
         return map_score(landmarks.run, landmarks.nees, landmarks.dof)
-    verdict, of_map = None, landmarks.record(last_nees(record))
+    verdict = None
+    of_map = landmarks.record(last_nees(record))
     if of_map is not None:
         found = findings_of(of_map, settings)
         verdict = _verdict(found, reasons(found))

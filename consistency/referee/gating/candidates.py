@@ -72,7 +72,8 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
     """
     a, row_a = _side("candidate a", name, candidate)
     b, row_b = _side("reference b", name, reference)
-    m, n = len(a.run_numbers), len(b.run_numbers)
+    m = len(a.run_numbers)
+    n = len(b.run_numbers)
     if m != n:
         raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
     if a.dof != b.dof:

@@ -52,7 +52,8 @@ def record_of_checked(
             raise ValueError(f"{option} needs errors and covariances: the nees does not know its components")
     if subsets is not None and deviations is not None:
         raise ValueError("subsets needs covariances: of deviations each component is judged by itself")
-    record, given = Record(name), {"errors": errors, key: size, "nees": nees}
+    record = Record(name)
+    given = {"errors": errors, key: size, "nees": nees}
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
         record = record_of_arrays(stated if nees is None or dof is None else {**stated, "dof": dof}, axes, name)
@@ -189,7 +190,8 @@ def _vectors(
 
     A step without a measurement is masked in either, or, where the innovations are not masked, all NaN.
     """
-    v, S = in_memory("innovations", vectors), in_memory("innovation_covariances", covariances)
+    v = in_memory("innovations", vectors)
+    S = in_memory("innovation_covariances", covariances)
     _require_runs("innovations", v.shape, gone)
     if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
         raise ValueError(
@@ -203,7 +205,10 @@ def _vectors(
     there: Array = np.asarray(~(absent if gone is None else absent | gone))
     _require_some("innovations", there, np.asarray(np.isfinite(v).all(axis=-1)))
     _require_some("innovation_covariances", there, np.asarray(np.isfinite(S).all(axis=(-2, -1))))
-    used, tracks, failures, S = np.zeros(there.shape, bool), [], [], S.copy()
+    used = np.zeros(there.shape, bool)
+    tracks = []
+    failures = []
+    S = S.copy()
     for run, steps in enumerate(there):
         k = np.flatnonzero(steps)
         place = steps_of("innovation_covariances", run, k)
@@ -211,7 +216,8 @@ def _vectors(
         tracks.append(Track(run, k, place, v[run, k], S[run, k]))
     longest = longest_start(tracks)
     for track in tracks:
-        k, (start, end, reason) = track.column, judged_rows(track, longest, "innovation")
+        k = track.column
+        (start, end, reason) = judged_rows(track, longest, "innovation")
         used[track.run, k[start:end]] = True
         if reason:
             reason = reason.replace("covariance", "innovation covariance")
@@ -221,7 +227,8 @@ def _vectors(
 
 def _nis(name: str, nis: ArrayLike, nis_dof: ArrayLike, gone: Array | None) -> tuple[Array, Indices, list[Failure]]:
     """NIS and its degrees of freedom, (runs, steps), which are 0 where it does not count, and failed runs."""
-    values, dof = in_memory("nis", nis), in_memory("nis_dof", nis_dof)
+    values = in_memory("nis", nis)
+    dof = in_memory("nis_dof", nis_dof)
     _require_runs("nis", values.shape, gone)
     if values.ndim != 2 or 0 in values.shape:
         raise ValueError(f"nis must have shape (runs, steps), got {values.shape}")
@@ -233,7 +240,8 @@ def _nis(name: str, nis: ArrayLike, nis_dof: ArrayLike, gone: Array | None) -> t
     dof = np.where(absent, 0.0, np.broadcast_to(dof, values.shape))
     if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
         raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
-    there, finite = np.asarray(dof > 0), np.asarray(np.isfinite(values))
+    there = np.asarray(dof > 0)
+    finite = np.asarray(np.isfinite(values))
     if (there & (values < 0)).any():
         run, step = np.argwhere(there & (values < 0))[0]
         raise ValueError(f"nis: negative in run {run}, step {step + 1}")

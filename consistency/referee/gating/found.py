@@ -43,7 +43,8 @@ def runs_to_decide(result: GateResult, runs: int) -> int:
     """Number of runs that would probably decide, above the present one; 0 for a comparison, which gives its own."""
     if result.verdict is None:
         return 0
-    shown, lost = result.verdict.equivalence, result.verdict.lost
+    shown = result.verdict.equivalence
+    lost = result.verdict.lost
     deciding = (shown.runs or 0) if shown is not None and not shown.shown else 0
     return max(runs + 1, deciding, (lost.needed or 0) if lost is not None else 0)
 

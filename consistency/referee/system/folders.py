@@ -81,8 +81,12 @@ class NewFolder:
         self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False, within: Path | None = None
     ) -> None:
         require_free(folder, overwrite, kind)
-        self.folder, self.kind, self.overwrite, self.keep_others = folder, kind, overwrite, keep_others
-        self.within, self.is_placed = within, False
+        self.folder = folder
+        self.kind = kind
+        self.overwrite = overwrite
+        self.keep_others = keep_others
+        self.within = within
+        self.is_placed = False
         if within is not None:
             self.path = within / "tables"
             shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended

@@ -66,7 +66,10 @@ def baseline(
     InputError
         A filter has no NEES, or nothing of it is left.
     """
-    first, filters, failures, axes = skip_asked(skip), {}, {}, {}
+    first = skip_asked(skip)
+    filters = {}
+    failures = {}
+    axes = {}
     of_runs: dict[int, str] = {}
     source = source_of(of)
     if not source.has_truth:
@@ -76,7 +79,8 @@ def baseline(
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
         of_runs |= record.trials
-        failures[each], axes[each] = len(record.failures), tuple(record.axes)
+        failures[each] = len(record.failures)
+        axes[each] = tuple(record.axes)
         own = record
         if not record.unshown:
             own = record.as_runs
@@ -96,7 +100,8 @@ def _option(skip: Skip | None) -> str | None:
 
 
 def _digest(truth: Path) -> str:
-    digest, paths = hashlib.sha256(), [truth]
+    digest = hashlib.sha256()
+    paths = [truth]
     if not truth.is_file():
         paths = sorted(path for path in truth.rglob("*") if path.is_file())
     for path in paths:
@@ -171,7 +176,9 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             raise ValueError("key 'filters': not a table")
         trials = _trials_of(data.get("trials", {}))  # files written before lack it
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
-    filters, failures, axes = {}, {}, {}
+    filters = {}
+    failures = {}
+    axes = {}
     for name, row in rows.items():
         filters[name], failures[name], axes[name] = row
     base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out, trials)
@@ -188,7 +195,8 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
     """
     asked = _option(skip_asked(skip))
     if base.skip != asked:
-        own, wanted = f"with --skip {base.skip}", f"with --skip {asked}"
+        own = f"with --skip {base.skip}"
+        wanted = f"with --skip {asked}"
         if base.skip is None:
             own = "of all steps"
         if asked is None:

@@ -31,7 +31,8 @@ class Compared:
     def sentence(self) -> str:
         c = self.comparison
         own, reference = self.names
-        found, way = "not found less consistent", "as independent samples"
+        found = "not found less consistent"
+        way = "as independent samples"
         if c.worse:
             found = "less consistent"
         if c.paired:
@@ -102,10 +103,12 @@ def compare_with(
         pairs = [(next(iter(new.filters)), next(iter(old.filters)))]
     if not pairs:
         raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
-    same, note = new.of_the_trials_of(old), ""
+    same = new.of_the_trials_of(old)
+    note = ""
     if new.trials and old.trials:
         old, common = _numbered_alike(new, old)
-        same, note = common >= FEWEST, f"{common} of {len(new.trials)} runs have the same seed and truth in both"
+        same = common >= FEWEST
+        note = f"{common} of {len(new.trials)} runs have the same seed and truth in both"
     elif not same:
         which = "Scenario or seed"
         if new.scenario is None and old.scenario is None:

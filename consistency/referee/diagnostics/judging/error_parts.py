@@ -67,7 +67,8 @@ def error_parts(
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown)
-    tails, by_group = tails_of(tests, record.run_numbers), by_group_of(record, sample, tests, given, settings)
+    tails = tails_of(tests, record.run_numbers)
+    by_group = by_group_of(record, sample, tests, given, settings)
     if sample.errors is None:
         return ErrorParts(scale, location, tails=tails, by_group=by_group)
     return ErrorParts(
@@ -94,7 +95,9 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
     if settings.tolerance is None:
         return tuple(given)
-    R, steps, dof = settings.tolerated, sample.longest, sample.dof
+    R = settings.tolerated
+    steps = sample.longest
+    dof = sample.dof
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
         return tuple(given)
     tolerated = {MAIN}
@@ -115,15 +118,18 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
 
 def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
     """Size of the errors; the inflation is that since the fault began, if it began late."""
-    dof, means = sample.dof, sample.means()
+    dof = sample.dof
+    means = sample.means()
     alive = sample.counted.sum(axis=0)
-    curve, band = anees(sample.nees), pointwise_band(alive, dof)
+    curve = anees(sample.nees)
+    band = pointwise_band(alive, dof)
     rate = SHARES[MAIN] * settings.false_alarm
     judged = alive > 0
     detectable = median_run = worst_run = share_inside = float("nan")
     if judged.any():
         detectable = detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided)
-        median_run, worst_run = float(np.median(means)) * dof, float(means.max()) * dof
+        median_run = float(np.median(means)) * dof
+        worst_run = float(means.max()) * dof
         inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
         share_inside = float(inside[judged].mean())
     of_log = None
@@ -155,7 +161,8 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
     """Inflation of each component and group, since the fault began."""
     errors = sample.known_errors
-    late, confidence = from_step(location.since), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
+    late = from_step(location.since)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
     inflation = {}
     for key, index in errors.groups.items():
         inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
@@ -177,16 +184,19 @@ def by_group_of(
         return None
     found = [sample.in_group(number) for number in range(len(groups.names))]
     there = sum(len(one.means) > 0 for one in found)
-    is_asked, is_found = any(answer.question == GROUP for answer in given), GROUP in faults_of(given)
+    is_asked = any(answer.question == GROUP for answer in given)
+    is_found = GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
-    by_group, spans = [], None if groups.edges is None else spans_of(groups.edges)
+    by_group = []
+    spans = None if groups.edges is None else spans_of(groups.edges)
     for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
         if not len(one.means):
             continue
         shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
-        p_value, status = float("nan"), ""
+        p_value = float("nan")
+        status = ""
         if is_asked:
             p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
             is_wrong = is_found and p_value <= settings.false_alarm
@@ -207,7 +217,8 @@ def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
 
 def bias_of(sample: Sample, step: int | None, location: Location, faults: set[str]) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    errors, late = sample.known_errors, from_step(location.since)
+    errors = sample.known_errors
+    late = from_step(location.since)
 
     def means(error: Array, covariance: Array, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
@@ -234,7 +245,8 @@ def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float)
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
-    errors, here = sample.known_errors, slice(None)
+    errors = sample.known_errors
+    here = slice(None)
     if tests.shape_step is not None and "shape" not in faults:
         here = slice(tests.shape_step - 1, tests.shape_step)
     counted = sample.counted[:, here]
@@ -248,9 +260,13 @@ def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float)
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    run, step, distance = -1, 0, float("nan")
+    run = -1
+    step = 0
+    distance = float("nan")
     if tests.outlier is not None:
-        run, step, distance = tests.outlier.run, tests.outlier.step + 1, tests.outlier.distance
+        run = tests.outlier.run
+        step = tests.outlier.step + 1
+        distance = tests.outlier.distance
     if run >= 0:
         run = int(run_numbers[run])
     return Tails(run, step, distance, tests.pit.values, tests.pit.half_width)
@@ -258,7 +274,8 @@ def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
 
 def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
-    errors, counted = sample.known_errors, sample.counted
+    errors = sample.known_errors
+    counted = sample.counted
     index, inclination = noncredibility(errors.error, sample.nees)
     inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
 
@@ -290,8 +307,11 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple
     """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
     if not counted.any():
         return None, float("nan"), float("nan")
-    n, count = error.shape[-1], int(counted.sum())
-    mean, stated, second = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
+    n = error.shape[-1]
+    count = int(counted.sum())
+    mean = np.zeros(n)
+    stated = np.zeros((n, n))
+    second = np.zeros((n, n))
     parts = list(block_slices(*counted.shape))
     for here in parts:
         mean += standardise(error[here], covariance[here])[counted[here]].sum(axis=0)

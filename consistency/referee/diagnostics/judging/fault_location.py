@@ -77,12 +77,15 @@ def _absent_before(sample: Sample, first: int, above: bool) -> bool:
 
     One-sided Student's t of the log mean before, with the standard error of the runs.
     """
-    early, late = sample.means(slice(0, first)), sample.means(slice(first, None))
+    early = sample.means(slice(0, first))
+    late = sample.means(slice(first, None))
     if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
         return False
-    log_early, log_late = np.log(early.mean()), np.log(late.mean())
+    log_early = np.log(early.mean())
+    log_late = np.log(late.mean())
     if not above:
-        log_early, log_late = -log_early, -log_late
+        log_early = -log_early
+        log_late = -log_late
     error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
     upper = log_early + float(distributions.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
     return bool(upper < 0.5 * log_late)
@@ -105,9 +108,11 @@ def until(sample: Sample, band: Band, detect: float) -> Until | None:
     for end, a, b in zip(ends, early.T, late.T, strict=True):
         if not a.mean() > 0 or not b.mean() > 0:
             continue
-        sign, outside = -1.0, band.below
+        sign = -1.0
+        outside = band.below
         if a.mean() > 1.0:
-            sign, outside = 1.0, band.above
+            sign = 1.0
+            outside = band.above
         left = sign * (np.log(b.mean()) - 0.5 * np.log(a.mean()))
         error = float((b / b.mean() - 0.5 * a / a.mean()).std(ddof=1))
         if left + bar * error >= 0.0 or outside[end:].any():
@@ -122,14 +127,16 @@ def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
     """Ends (K,) of the first steps, and mean NEES over dof before and after each, (runs, K), of runs with both."""
     judged = np.flatnonzero(sample.counted.any(axis=0))
     ends = judged[2 ** np.arange((len(judged) // 2).bit_length()) - 1] + 1
-    means, counts = [], []
+    means = []
+    counts = []
     for piece in np.split(sample.nees, ends, axis=1):
         of_runs, steps = run_means(piece)
         means.append(of_runs)
         counts.append(steps)
     count = np.stack(counts, axis=-1)
     sums = np.where(count > 0, np.stack(means, axis=-1) * count, 0.0)
-    sum_before, count_before = np.cumsum(sums, axis=1)[:, :-1], np.cumsum(count, axis=1)[:, :-1]
+    sum_before = np.cumsum(sums, axis=1)[:, :-1]
+    count_before = np.cumsum(count, axis=1)[:, :-1]
     sum_after = sums.sum(axis=1)[:, None] - sum_before
     count_after = count.sum(axis=1)[:, None] - count_before
     both = (count_before > 0).all(axis=1) & (count[:, -1] > 0)
@@ -146,7 +153,8 @@ def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
     fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
-    names, n = sample.known_errors.names, sample.dof
+    names = sample.known_errors.names
+    n = sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
         return None
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)

@@ -96,7 +96,8 @@ def findings_of(
     joint = _joint(record, settings)
     if joint is not None:
         p_values |= joint.p_values
-    sample, tests = sample_of(record, settings), None
+    sample = sample_of(record, settings)
+    tests = None
     if sample is not None:
         tests = run_tests(sample, settings, p_values, inspection and inspection.scale)
         asked = tests.p_values
@@ -109,7 +110,9 @@ def findings_of(
     given = tuple(answers(p_values, settings.false_alarm).values())
     given = with_tolerated(given, _tolerated(joint, innovations, settings))
 
-    parts, lost, ends = ErrorParts(), None, None
+    parts = ErrorParts()
+    lost = None
+    ends = None
     impossible: list[tuple[int, int]] = []
     left_out: list[int] = []
     if sample is not None and tests is not None:
@@ -120,7 +123,8 @@ def findings_of(
         if record.landmarks is None:
             ends = _early_ends(sample)
         if sample.errors is not None:
-            impossible, left_out = _impossible(record, sample), _left_out_steps(record, sample)
+            impossible = _impossible(record, sample)
+            left_out = _left_out_steps(record, sample)
     broken = bool(record.failures or impossible or (joint is not None and joint.score.not_definite))
 
     faults = set(faults_of(given))
@@ -134,7 +138,8 @@ def findings_of(
         status = status_by_errors(given, settings, sample, tests, joint, parts)
     share = None
     if truth is not None:
-        share, status = truth.truth_share(), truth.status(status, given, settings)
+        share = truth.truth_share()
+        status = truth.status(status, given, settings)
         parts = _parts_of_estimate(truth, parts, given, settings)
     unshown, status, scale = withheld(unshown, status, parts.scale)
     later = status == "consistent" and inspection is not None and inspection.spent is None
@@ -185,7 +190,8 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
     if found is None:
         return None, {}
     nis, dof = found
-    test, interval = nis_test(nis, dof), UNKNOWN_ENDS
+    test = nis_test(nis, dof)
+    interval = UNKNOWN_ENDS
     if test.dof:
         interval = chi2_mean_interval(test.dof, CONFIDENCE)
     if record.innovations is not None and record.innovation_covariances is not None:
@@ -275,7 +281,9 @@ def _parts_of_estimate(
     assert parts.bias is not None
     assert parts.accuracy is not None
     assert parts.location is not None
-    size, clearest, whitened = accuracy_of(truth.total), None, truth.total.known_errors.whitened
+    size = accuracy_of(truth.total)
+    clearest = None
+    whitened = truth.total.known_errors.whitened
     if whitened.shape[1] > 1:
         _, clearest = least_of_steps(t_squared(whitened)[1])  # whatever the truth allows
     mean = bias_of(truth.total, clearest, parts.location, set(faults_of(given)))

@@ -48,7 +48,9 @@ def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> 
     whole = findings_of(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
     nees = _nees_over_n(record)
     lost = lost_of(record, nees, 1, settings)  # a mean of chi-square(1), however they depend on each other
-    innovations, accuracy, scale = whole.innovations, whole.accuracy, whole.scale
+    innovations = whole.innovations
+    accuracy = whole.accuracy
+    scale = whole.scale
     if INNOVATIONS in parts:
         innovations = parts[INNOVATIONS].innovations
     if accuracy is not None:
@@ -81,7 +83,8 @@ def _records_of_parts(record: Record) -> dict[str, Record]:
     covariance = np.asarray(record.covariance, float)
     records = {}
     for index in record.parts:
-        some, axes = list(index), tuple(names[i] for i in index)
+        some = list(index)
+        axes = tuple(names[i] for i in index)
         records[", ".join(axes)] = replace(
             record,
             error=record.error[..., some],
@@ -152,7 +155,8 @@ def _answers(parts: Mapping[str, Findings], settings: Settings) -> list[Answer]:
         among = settings.false_alarm / part.settings.false_alarm  # parts that shared the rate with it
         for answer in part.answers:
             adjusted = min(1.0, answer.adjusted * among)
-            question, share = f"{answer.question} of {name}", answer.share / len(parts)
+            question = f"{answer.question} of {name}"
+            share = answer.share / len(parts)
             given.append(replace(answer, question=question, share=share, adjusted=adjusted))
     return given
 

@@ -86,7 +86,8 @@ def status_by_innovations(faults: Collection[str], innovations: Innovations | No
     """The status where innovations alone are at fault: by the rest of them where outliers are among them."""
     if "innovation scale" not in faults or innovations is None:
         return "inconsistent"
-    far, rate = innovations.outliers, settings.false_alarm
+    far = innovations.outliers
+    rate = settings.false_alarm
     if far is None or far.rest.above <= rate:
         return _side(innovations.ratio)
     if far.rest.below <= rate and not settings.one_sided:
@@ -131,7 +132,9 @@ def deciding_axis(found: Findings) -> tuple[str, Interval] | None:
     It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction, or looks
     right: its ratio lies in [1 / detect, detect], and the interval of the axis outside.
     """
-    axis, factor, faults = clear(found.worst_axis), found.settings.factor, found.faults
+    axis = clear(found.worst_axis)
+    factor = found.settings.factor
+    faults = found.faults
     if found.parts:
         of_parts = {question for part in found.parts.values() for question in part.faults}
         if not of_parts & set(SCALE):
@@ -216,7 +219,8 @@ def _status_of_steps(settings: Settings, faults: set[str], sample: Sample, tests
         return "inconsistent"
     curve = anees(sample.nees)
     with np.errstate(divide="ignore", invalid="ignore"):
-        above, below = np.nanmax(curve / tests.band.high), np.nanmax(tests.band.low / curve)
+        above = np.nanmax(curve / tests.band.high)
+        below = np.nanmax(tests.band.low / curve)
     if above >= below:
         return "overconfident"
     return "conservative"
@@ -289,7 +293,8 @@ def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:
     if settings.one_sided or sample.errors is None:
         return False
     whole = float(np.log(max(tests.main.ratio, TINY)))
-    ratios, wrong = [], []
+    ratios = []
+    wrong = []
     for axis in sample.errors.names:
         test = tests.axes[axis]
         ratios.append(test.ratio)

@@ -18,7 +18,8 @@ from consistency.referee.diagnostics.records.whitening import all_finite, square
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
-POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+POSITION = {"x", "y", "z"}
+ATTITUDE = {"heading", "roll", "pitch", "yaw"}
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ class Sample:
 
     def centre(self) -> Centre:
         """Mean error over runs in each step."""
-        error, N = self.known_errors.error, self.counted.sum(axis=0)[:, None]
+        error = self.known_errors.error
+        N = self.counted.sum(axis=0)[:, None]
         total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), error, self.counted)
         factor = np.sqrt(N / np.maximum(N - 1, 1))
         return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
@@ -141,7 +143,8 @@ class Sample:
 
         Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
         """
-        e, centre = self.known_errors, self.centre()
+        e = self.known_errors
+        centre = self.centre()
         for here in of_runs(self.counted):
             w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
             e.whitened[here], self.nees[here] = w, squared_length(w)
@@ -164,8 +167,10 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
         return Sample(record.nees, record.dof, groups=record.groups)
     names = names_of(record)
     groups = component_groups(names, settings.subsets)
-    error, P = record.error, np.asarray(record.covariance, float)
-    whitened, nees = np.empty(error.shape), np.empty(error.shape[:2])
+    error = record.error
+    P = np.asarray(record.covariance, float)
+    whitened = np.empty(error.shape)
+    nees = np.empty(error.shape[:2])
     for here in of_runs(nees):
         w = whiten(error[here], P[here])
         counted = all_finite(w)

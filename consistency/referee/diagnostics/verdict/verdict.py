@@ -111,14 +111,16 @@ class Findings:
             side = -1.0
         elif self.settings.one_sided:
             side = 1.0
-        worst, farthest = None, -np.inf
+        worst = None
+        farthest = -np.inf
         for axis, interval in self.axes.inflation.items():
             log = float(np.log(max(interval.value, TINY)))
             if axis not in self.axes.names or not np.isfinite(log):
                 continue
             distance = side * log if side else abs(log)
             if distance > farthest:
-                worst, farthest = (axis, interval), distance
+                worst = (axis, interval)
+                farthest = distance
         return worst
 
     @property

@@ -39,9 +39,11 @@ def scale_text(v: Findings) -> str:
         return _axes_text(v)
     if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _wrong(v, -1):
         return _correlation_text(v)
-    inflation, about = v.scale.inflation, ""
+    inflation = v.scale.inflation
+    about = ""
     if v.bias is not None and v.bias.inflation_without is not None:
-        inflation, about = v.bias.inflation_without, " about the mean"
+        inflation = v.bias.inflation_without
+        about = " about the mean"
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
@@ -125,7 +127,8 @@ def _steps_text(v: Findings) -> str:
     """Steps above and below the band, each side with their number, the first, and on the verdict's side the largest."""
     assert v.scale is not None
     assert v.location is not None
-    ratio, (low, high) = v.scale.anees / v.scale.dof, v.location.simultaneous.T / v.scale.dof
+    ratio = v.scale.anees / v.scale.dof
+    (low, high) = v.location.simultaneous.T / v.scale.dof
     own = SIDES.get(v.status, 0)
     signs = [1, -1]
     if own == -1:
@@ -158,7 +161,8 @@ def opposite(v: Findings) -> bool:
 def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
     """Components wrong to one side beyond doubt, the farthest first; groups where no component is."""
     assert v.axes is not None
-    components, groups = [], []
+    components = []
+    groups = []
     for axis, interval in v.axes.inflation.items():
         beyond = interval.low > 1.0
         if sign < 0:
@@ -251,9 +255,12 @@ def shape_text(v: Findings) -> str:
     """The two axes that are correlated least as stated, where it can be seen."""
     assert v.shape is not None
     assert v.axes is not None
-    shape, where, worth_a_word = v.shape, "", VISIBLE
+    shape = v.shape
+    where = ""
+    worth_a_word = VISIBLE
     if "shape" not in v.faults:
-        where, worth_a_word = f" in {v.place(shape.step or 1)}", NOTABLE
+        where = f" in {v.place(shape.step or 1)}"
+        worth_a_word = NOTABLE
     gap = abs(shape.actual - shape.stated)
     if shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
@@ -301,7 +308,8 @@ def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> 
 
 def joint_text(v: Findings, joint: JointScore) -> str:
     """What pose and map together say, and which of the two parts stands out, or which landmarks."""
-    pose_is_wrong, map_is_wrong = not joint.pose.holds(1.0), not joint.map.holds(1.0)
+    pose_is_wrong = not joint.pose.holds(1.0)
+    map_is_wrong = not joint.map.holds(1.0)
     part = ""
     if pose_is_wrong and not map_is_wrong:
         part = ", mainly the pose"

@@ -48,7 +48,8 @@ def _faults(by: ByGroup) -> str:
 
 def _without_fault(by: ByGroup) -> str:
     """What is shown of the groups where none is at fault, and the one that is farthest."""
-    worst, count = by.worst, len(by.groups)
+    worst = by.worst
+    count = len(by.groups)
     if not worst.status:
         return f"groups by {by.column} are reported and not judged"
     right = sum(group.status == "consistent" for group in by.groups)

@@ -92,14 +92,16 @@ def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
 def _failures(v: Findings) -> list[str]:
     lines = []
     if v.failures:
-        first, count = v.failures[0], len({failure.run for failure in v.failures})
+        first = v.failures[0]
+        count = len({failure.run for failure in v.failures})
         where = f"{v.unit} {first.run}"
         if v.unit == "run":
             where += f" in step {first.step}" if v.landmarks is not None else f" in {v.place(first.step)}"
         lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
-        count, have = len({run for run, _ in v.impossible}), "have"
+        count = len({run for run, _ in v.impossible})
+        have = "have"
         if count == 1:
             have = "has"
         lines.append(
@@ -135,7 +137,8 @@ def _first_steps(v: Findings) -> list[str]:
         ]
     if v.location is None or v.location.until is None:
         return []
-    until, where = v.location.until, "the first step"
+    until = v.location.until
+    where = "the first step"
     if until.step > 1:
         where = f"the first {until.step} steps"
     return [
@@ -149,7 +152,8 @@ def _fault(v: Findings, s: Scale) -> str:
     """The sentence where a question found a fault."""
     if v.parts:
         return _faults_of_parts(v)
-    of_scale, of_bias = _any_of(SCALE, v.faults), _any_of(BIAS, v.faults)
+    of_scale = _any_of(SCALE, v.faults)
+    of_bias = _any_of(BIAS, v.faults)
     is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
     found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
     contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in v.faults
@@ -205,8 +209,11 @@ def _faults_of_parts(v: Findings) -> str:
 
 def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
-    shown, runs = s.equivalence, plural(v.runs, v.unit)
-    none, size, axis = "no fault found", f"covariance ratio {_ratio_of_test(s)}", ""
+    shown = s.equivalence
+    runs = plural(v.runs, v.unit)
+    none = "no fault found"
+    size = f"covariance ratio {_ratio_of_test(s)}"
+    axis = ""
     if any(answer.tolerated for answer in v.answers):
         none = "no fault beyond the tolerance"
     if v.parts:
@@ -250,7 +257,10 @@ def _lost(v: Findings) -> str:
     """Lost runs, and the share of them that is shown or not excluded."""
     if v.lost is None or not _has_lost(v):
         return ""
-    lost, asked, unit, some = v.lost, v.settings.lost, v.unit, ""
+    lost = v.lost
+    asked = v.settings.lost
+    unit = v.unit
+    some = ""
     if lost.count:
         some = f"{plural(lost.count, unit)} of {lost.runs} {is_or_are(lost.count)} lost"
     if asked is not None and lost.upper <= asked:
@@ -314,7 +324,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         )
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
-    worst, of_all = clear(v.worst_axis), ratio_text(s.inflation)
+    worst = clear(v.worst_axis)
+    of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif _any_of(SCALE, v.faults) and v.worst_axis is not None:
@@ -501,7 +512,8 @@ def sentences_of_conventions(
     found: Mapping[str, ConventionResult], verdicts: Mapping[str, Verdict], settings: Settings
 ) -> list[str]:
     """Which conventions of the error are not rejected, and the sentence of each."""
-    left, gone = [], []
+    left = []
+    gone = []
     for kind, result in found.items():
         if result.possible:
             left.append(f"{kind} (covariance ratio {ratio_text(result.ratio)})")

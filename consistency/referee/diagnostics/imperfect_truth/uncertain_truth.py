@@ -122,7 +122,7 @@ class UncertainTruth:
     @cached_property
     def groups(self) -> Mapping[str, list[int]]:
         """All components (MAIN), and each group of the sample."""
-        return {MAIN: list(range(self.total.dof))} | dict(self.total.known_errors.groups)
+        return {MAIN: list(range(self.total.dof))} | dict(self.total.components)
 
     @cached_property
     def by_group(self) -> Mapping[str, Array]:
@@ -199,21 +199,22 @@ class UncertainTruth:
 
     def _bias(self) -> dict[str, float]:
         """p values of a mean error: by the spread of the runs, and beyond what the truth allows."""
-        e = self.total.known_errors
+        whitened = self.total.whitened
+        assert whitened is not None
         counted = self.total.counted
         runs: Array = np.asarray(counted.any(axis=1))
         steps: Array = np.asarray(counted.any(axis=0))
         if runs.sum() <= self.total.dof:
             return dict.fromkeys(BIAS, float("nan"))
-        error = np.where(counted[..., None], e.error, np.nan)
+        error = np.where(counted[..., None], self.total.error, np.nan)
         P = self._counted_entries(self.P)
         P_t = self._counted_entries(self.P_t)
-        spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
+        spread = hotelling(mean_of_runs(whitened)[runs]).p_value
         mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, P_t))
         allowed = self._allowed(mean, stated, of_truth, np.array(runs.sum()))
         p = {BIAS[0]: max(spread, float(allowed))}
         if len(steps) > 1:
-            _, spreads = t_squared(e.whitened[:, steps])
+            _, spreads = t_squared(whitened[:, steps])
             mean, stated, of_truth = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, P_t))
             in_steps = self._allowed(mean, stated, of_truth, counted.sum(axis=0)[steps])
             p[BIAS[1]], _ = least_of_steps(np.maximum(spreads, in_steps))

@@ -69,7 +69,7 @@ def error_parts(
     scale = scale_of(sample, tests, scaled, location, shown)
     tails = tails_of(tests, record.run_numbers)
     by_group = by_group_of(record, sample, tests, given, settings)
-    if sample.errors is None:
+    if sample.whitened is None:
         return ErrorParts(scale, location, tails=tails, by_group=by_group)
     return ErrorParts(
         scale,
@@ -101,8 +101,8 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
         return tuple(given)
     tolerated = {MAIN}
-    if sample.errors is not None:
-        groups = sample.errors.groups.values()
+    if sample.whitened is not None:
+        groups = sample.components.values()
         if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
             tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
@@ -160,15 +160,14 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 
 def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
     """Inflation of each component and group, since the fault began."""
-    errors = sample.known_errors
     late = from_step(location.since)
-    confidence = 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
     inflation = {}
-    for key, index in errors.groups.items():
+    for key, index in sample.components.items():
         inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
     if tests.largest is None:
-        return ComponentRatios(errors.names, errors.groups, inflation)
-    return ComponentRatios(errors.names, errors.groups, inflation, tests.largest.ratio, tests.largest.direction)
+        return ComponentRatios(sample.names, sample.components, inflation)
+    return ComponentRatios(sample.names, sample.components, inflation, tests.largest.ratio, tests.largest.direction)
 
 
 def by_group_of(
@@ -217,44 +216,42 @@ def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
 
 def bias_of(sample: Sample, step: int | None, location: Location, faults: set[str]) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    errors = sample.known_errors
     late = from_step(location.since)
 
     def means(error: Array, covariance: Array, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
 
-    of_runs = by_runs(means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
+    of_runs = by_runs(means, sample.error[:, late], sample.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
         test = hotelling(of_runs, CONFIDENCE)
-        for i, axis in enumerate(errors.names):
+        for i, axis in enumerate(sample.names):
             by_axis[axis] = Interval(test.mean[i], *test.interval[i])
     if not faults & set(BIAS):
         return Bias(by_axis, step, None, None, None)
     without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
     if step is None:
         return Bias(by_axis, step, None, None, without)
-    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+    at = standardise(sample.error[:, step - 1], sample.covariance[:, step - 1])[sample.counted[:, step - 1]]
     mean = at.mean(axis=0)
     chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(TINIEST)))  # what stands out most
-    return Bias(by_axis, step, errors.names[chief], float(mean[chief]), without)
+    return Bias(by_axis, step, sample.names[chief], float(mean[chief]), without)
 
 
 def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
     if tests.matrix is None or sample.dof == 1:
         return None
-    errors = sample.known_errors
     here = slice(None)
     if tests.shape_step is not None and "shape" not in faults:
         here = slice(tests.shape_step - 1, tests.shape_step)
     counted = sample.counted[:, here]
-    pair, actual, stated = _correlation(errors.error[:, here], errors.covariance[:, here], counted)
+    pair, actual, stated = _correlation(sample.error[:, here], sample.covariance[:, here], counted)
     known = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
     opposite = actual * stated < 0.0 and abs(actual) > known and abs(stated) > VISIBLE
     wrong_sign = bool(faults & set(SHAPE)) and opposite
-    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in errors.names)
+    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in sample.names)
     return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
 
 
@@ -274,22 +271,21 @@ def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
 
 def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
-    errors = sample.known_errors
     counted = sample.counted
-    index, inclination = noncredibility(errors.error, sample.nees)
-    inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
+    index, inclination = noncredibility(sample.error, sample.nees)
+    inside, interval = coverage_interval(sample.error, sample.covariance, counted=counted)
 
     def rmse_of(members: set[str]) -> float:
-        columns = [i for i, axis in enumerate(errors.names) if axis in members]
+        columns = [i for i, axis in enumerate(sample.names) if axis in members]
         if not columns:
             return float("nan")
-        return rmse(errors.error, columns, counted)
+        return rmse(sample.error, columns, counted)
 
     return Accuracy(
-        coverage=coverage(errors.error, errors.covariance, counted=counted),
+        coverage=coverage(sample.error, sample.covariance, counted=counted),
         coverage_one_step=inside,
         coverage_interval=interval,
-        rmse=np.array([rmse(errors.error, [i], counted) for i in range(sample.dof)]),
+        rmse=np.array([rmse(sample.error, [i], counted) for i in range(sample.dof)]),
         rmse_position=rmse_of(POSITION),
         rmse_heading=rmse_of(ATTITUDE),
         nci=_mean_of_known(index),

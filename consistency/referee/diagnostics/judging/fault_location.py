@@ -45,7 +45,7 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
                 lasting = _is_lasting(sample, band, first)
             if lasting and _absent_before(sample, first, band.above[first]):
                 since = first_step
-    if sample.errors is not None and faults & set(SCALE):
+    if sample.whitened is not None and faults & set(SCALE):
         subset = chief_axes(sample, from_step(since), MAIN in faults)
     if ordered and faults & {*SCALE, *BIAS}:
         last = until(sample, band, detect)
@@ -153,7 +153,7 @@ def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
     fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
-    names = sample.known_errors.names
+    names = sample.names
     n = sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
         return None

@@ -122,7 +122,7 @@ def findings_of(
         lost = lost_of(record, sample.nees, sample.dof, settings, any_time=inspection is not None)
         if record.landmarks is None:
             ends = _early_ends(sample)
-        if sample.errors is not None:
+        if sample.whitened is not None:
             impossible = _impossible(record, sample)
             left_out = _left_out_steps(record, sample)
     broken = bool(record.failures or impossible or (joint is not None and joint.score.not_definite))
@@ -283,7 +283,8 @@ def _parts_of_estimate(
     assert parts.location is not None
     size = accuracy_of(truth.total)
     clearest = None
-    whitened = truth.total.known_errors.whitened
+    whitened = truth.total.whitened
+    assert whitened is not None
     if whitened.shape[1] > 1:
         _, clearest = least_of_steps(t_squared(whitened)[1])  # whatever the truth allows
     mean = bias_of(truth.total, clearest, parts.location, set(faults_of(given)))

@@ -201,7 +201,7 @@ def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, test
     if STEP in faults and not heavy:
         return _status_of_sides({_status_of_steps(settings, faults, sample, tests), *of_groups})
     if AXIS in faults or DIRECTION in faults:
-        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
+        if sample.whitened is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
             return _status_of_sides({_status_of_axes(settings, tests), *of_groups})
         heavy = True
     if GROUP in faults and not heavy:
@@ -246,7 +246,7 @@ def _robust(
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
-    groups = sample.known_errors.groups
+    groups = sample.components
     for key, test in tests.axes.items():
         found = sided_p_value(test, settings) * len(groups) <= settings.false_alarm
         if found and _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups)):
@@ -290,12 +290,12 @@ def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:
     Any does where the whole is too large, because nothing is too small in a conservative covariance. Where it is too
     small, one that is farther from 1 than the whole, or all together, so that correlations make the whole too small.
     """
-    if settings.one_sided or sample.errors is None:
+    if settings.one_sided or sample.whitened is None:
         return False
     whole = float(np.log(max(tests.main.ratio, TINY)))
     ratios = []
     wrong = []
-    for axis in sample.errors.names:
+    for axis in sample.names:
         test = tests.axes[axis]
         ratios.append(test.ratio)
         if test.p_value * len(tests.axes) <= settings.false_alarm:

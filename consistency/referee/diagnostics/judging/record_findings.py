@@ -99,7 +99,10 @@ def findings_of(
     sample = sample_of(record, settings)
     tests = None
     if sample is not None:
-        tests = run_tests(sample, settings, p_values, inspection and inspection.scale)
+        scale_p_value = None
+        if inspection is not None:
+            scale_p_value = inspection.scale
+        tests = run_tests(sample, settings, p_values, scale_p_value)
         asked = tests.p_values
         if truth is not None:
             asked = truth.p_values(asked, settings)

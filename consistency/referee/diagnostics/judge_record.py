@@ -64,9 +64,11 @@ def judge(
     ValueError
         Nothing to judge is given, or shapes or options do not fit.
     """
+    kept = None
+    if keep_record:
+        kept = record
     if design is not None:
-        return follow(design, record.first_runs, len(record.run_numbers))[0]
-    kept = record if keep_record else None
+        return follow(design, record.first_runs, len(record.run_numbers), kept)[0]
     if record.guesses:
         return _judge_conventions(record, settings, kept)
     evidence = record.as_runs
@@ -229,13 +231,16 @@ def speaks(design: Design, evidence: Record, spent: float | None) -> bool:
     return spent is not None or _p_of_scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
 
 
-def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | None = None) -> tuple[Verdict, int]:
+def follow(
+    design: Design, evidence_of: Callable[[int], Record], limit: int | None = None, kept: Record | None = None
+) -> tuple[Verdict, int]:
     """Inspect runs until decided; return the verdict and the number of runs used.
 
     Parameters
     ----------
     evidence_of : function that returns the first k runs of a filter
     limit : number of available runs; the last inspection within it decides, or all runs if they are fewer than 12
+    kept : record of all runs, kept with the verdict to be drawn
     """
     for runs, spent, is_last in _inspections(design, limit):
         evidence = evidence_of(runs)
@@ -243,7 +248,7 @@ def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | No
             continue
         found = _inspected(design, evidence, spent)
         if is_last or found.status != "undecided":
-            return _of_look(design, evidence, runs, found), runs
+            return _of_look(design, evidence, runs, found, kept), runs
     raise AssertionError("unreachable: a design without a last look is endless")
 
 
@@ -291,13 +296,15 @@ def _inspected(design: Design, evidence: Record, spent: float | None) -> Finding
     return findings_of(evidence, design.settings, Inspection(spent, _p_of_scale(design, evidence)))
 
 
-def _of_look(design: Design, evidence: Record, runs: int, found: Findings) -> Verdict:
+def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept: Record | None = None) -> Verdict:
     """The verdict of a look at the first ``runs``, with what is known beside them."""
     world = None
     if evidence.world is not None:
         errors = replace(evidence.in_world, map=None, rejections=None, caption="", causes=(), notes=(), convention="")
         world, _ = follow(design, errors.first_runs, runs)
-    return _whole(evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs))
+    return _whole(
+        evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs), record=kept
+    )
 
 
 def _p_of_scale(design: Design, evidence: Record) -> float:

@@ -123,17 +123,16 @@ def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
+    filters = {}
+    for name, rows in base.filters.items():
+        filters[name] = plain(vars(rows)) | {"failures": base.failures[name], "axes": list(base.axes[name])}
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
         origin=list(base.origin),
         skip=base.skip,
         trials={str(run): trial for run, trial in base.trials.items()},
-        filters={
-            name: {key: plain(value) for key, value in vars(s).items()}
-            | {"failures": base.failures[name], "axes": list(base.axes[name])}
-            for name, s in base.filters.items()
-        },
+        filters=filters,
     )
     with writing(path):
         write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
@@ -208,15 +207,15 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
 def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]]:
     """One filter in the file, values of R runs: a summary as the referee takes it, failed runs, names of components."""
     _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
-    runs = [_whole(run, f"{place}.runs.{k}", 0, 2**63) for k, run in enumerate(_list(table["runs"], f"{place}.runs"))]
+    runs = _list(table["runs"], f"{place}.runs")
+    for k, run in enumerate(runs):
+        _whole(run, f"{place}.runs.{k}", 0, 2**63)
     if len(set(runs)) < len(runs):
         raise ValueError(f"key '{place}.runs': a run is duplicated")
-    nees = _numbers(table["nees"], f"{place}.nees")
-    squared, covered = (
-        [_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(_list(table[key], f"{place}.{key}"))]
-        for key in ("squared", "covered")
-    )
-    parts = [np.array(values, float) for values in (nees, squared, covered)]
+    parts = [np.array(_numbers(table["nees"], f"{place}.nees"), float)]
+    for key in ("squared", "covered"):
+        rows = _list(table[key], f"{place}.{key}")
+        parts.append(np.array([_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(rows)], float))
     if {len(part) for part in parts} != {len(runs)} or parts[1].shape != parts[2].shape:
         raise ValueError(f"key '{place}': its lists are not equally long")
     dof = _whole(table["dof"], f"{place}.dof", 1, HIGHEST_DOF + 1)

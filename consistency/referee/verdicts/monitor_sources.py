@@ -44,7 +44,9 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
         The declaration is missing, or an option is out of its range.
     """
     if innovations != OPTIMAL:
-        value = "" if innovations is None else f", got '{innovations}'"
+        value = ""
+        if innovations is not None:
+            value = f", got '{innovations}'"
         raise InputError(
             f"--innovations must be '{OPTIMAL}'{value}: declare that the filter has the optimal (Kalman) gain for its "
             "model. Of any other filter the innovations are not white, and no false-alarm rate holds"

@@ -6,15 +6,16 @@
 Errors are drawn with the covariance D P D + F, where P is stated. They depend on the step before by rho, from none to
 nearly all. Printed for each row: how often the intervals of factor and floor hold the truth (their product where they
 cannot be told apart), their width over that of an oracle, which knows the distribution of the fit over draws of the
-same world, and the mean held-out ratio after. Then, for estimators that no factor can mend, how often "consistent
-after" is said. Exit status 1 if a promise is broken (binomial, 1 % for all rows together).
+same world, and the mean held-out ratio after; where nothing is wrong also how often each interval of a factor holds 1,
+and how often a factor is said to be needed. Then factors by group (``--by``), and, for estimators that no factor can
+mend, how often "consistent after" is said. Exit status 1 if a promise is broken (binomial, 1 % for all rows together).
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -23,10 +24,11 @@ from scipy import stats
 from script_options import options_of
 
 from consistency.referee.diagnostics.questions.scale import run_means
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
-from consistency.referee.fit_covariance.correct import correct, with_factors
+from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, with_factors
 from consistency.referee.fit_covariance.factors import Factors, Fit, blocks_of, fit_alone
 from consistency.referee.fit_covariance.floors import SAME, fit_runs, fit_with_floors
 from consistency.referee.types import Array
@@ -58,6 +60,11 @@ class World:
         P = self.stated(rng)
         C = self.true.applied(P)
         return record_of((np.linalg.cholesky(C) @ self.white(rng)[..., None])[..., 0], P)
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the stated covariance is that of the errors."""
+        return set(self.factors) == {1.0} and set(self.floors) == {0.0}
 
     @property
     def true(self) -> Factors:
@@ -93,7 +100,8 @@ class Row(NamedTuple):
     covered: float
     width: float  # over the oracle's
     ratio: float  # held out, after
-    one_inside: float
+    one_inside: float  # NaN where something is wrong
+    needed: float  # a factor is said to be needed
 
 
 def before_dropping(record: Record, fit: Fit) -> Factors:
@@ -111,7 +119,7 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
     true = world.true
     B = len(true.blocks)
     held = np.zeros((draws, 2 * B))
-    logs, widths, ratios = np.zeros((draws, B)), np.zeros((draws, B)), np.zeros(draws)
+    logs, widths, ratios, needed = np.zeros((draws, B)), np.zeros((draws, B)), np.zeros(draws), np.zeros(draws)
     for i in range(draws):
         record = world.drawn(rng)
         fit = fit_runs(record, true.blocks)
@@ -119,6 +127,7 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
         after = with_factors(record, [(factors,) for factors in fit.left_out])
         assert after.nees is not None
         ratios[i] = run_means(after.nees)[0].mean() / world.n
+        needed[i] = are_needed([fit])
         for b, block in enumerate(true.blocks):
             factor, floor = fit.factor[b], fit.floor[b]
             same = any(SAME in note and note.startswith(block.name) for note in fit.notes)
@@ -127,21 +136,41 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
             logs[i, b] = np.log(whole[b])
             widths[i, b] = np.log(factor.high / max(factor.low, 1e-12))
     oracle = 2 * stats.norm.isf(0.025) * logs.std(axis=0, ddof=1)
-    ones = held[:, :B].mean(axis=0) if not true.floor.any() and (true.factor == 1.0).all() else np.ones(1)
+    ones = held[:, :B].mean(axis=0).min() if world.is_right else np.nan
     return Row(
         float(held.mean(axis=0).min()), float((np.median(widths, axis=0) / oracle).max()), float(ratios.mean()),
-        float(ones.min()),
+        float(ones), float(needed.mean()),
     )  # fmt: skip
+
+
+def of_groups(runs: int, rho: float, draws: int, rng: np.random.Generator) -> float:
+    """Share of intervals that hold the factor of a block, 4, 1 or 0.25 by the group that changes every ten steps."""
+    world = World(6, runs, rho, (1.0,))
+    sizes = np.array([4.0, 1.0, 0.25])
+    held = np.zeros((draws, 3, 2))
+    for i in range(draws):
+        right = world.drawn(rng)
+        index = np.repeat(rng.integers(0, 3, (runs, STEPS // 10)), 10, axis=1)
+        assert right.error is not None
+        assert right.covariance is not None
+        record = record_of(right.error * np.sqrt(sizes[index])[..., None], right.covariance)
+        groups = Groups("speed", ("low", "middle", "high"), index, (1.0, 2.0))
+        fits = fit_groups(replace(record, groups=groups), world.true.blocks)
+        for g, name in enumerate(groups.names):
+            held[i, g] = [factor.holds(sizes[g]) for factor in fits[name].factor]
+    return float(held.mean(axis=0).min())
 
 
 WORLDS = (
     *(World(n, runs, rho, (30.0, 0.3, 3.0)) for n, runs, rho in product((2, 6), (10, 30, 100), (0.0, 0.9, 0.999))),
-    World(15, 30, 0.9, (0.3, 30.0, 3.0, 1.0)),
-    *(World(6, runs, rho, (1.0,)) for runs, rho in product((10, 30), (0.0, 0.999))),
+    *(World(15, 30, rho, (0.3, 30.0, 3.0, 1.0)) for rho in (0.0, 0.9, 0.999)),
+    *(World(6, runs, rho, (1.0,)) for runs, rho in product((10, 30), (0.0, 0.9, 0.999))),
     *(World(3, runs, rho, (2.0,), (5.0,)) for runs, rho in product((10, 30, 100), (0.0, 0.9, 0.999))),
     *(World(6, 30, rho, (2.0, 1.0), (5.0, 0.5)) for rho in (0.0, 0.999)),
     *(World(3, runs, 0.9, (0.5,), (3.0,), 0.3) for runs in (10, 30)),
 )
+
+BY_GROUP = tuple(product((10, 30), (0.0, 0.9, 0.999)))
 
 
 # --- what no factor mends ---------------------------------------------------------------------------------------------
@@ -192,7 +221,8 @@ def broken(draws: int, rows: int, rng: np.random.Generator) -> Iterator[str]:
         row = row_of(world, draws, rng)
         size = f"n {world.n:2d}, {world.runs:3d} runs, rho {world.rho:5.3f}"
         name = f"{size}, factors, floors {world.factors}, {world.floors}"
-        print(f"{name}: covered {row.covered:.3f}, width x{row.width:.2f}, ratio {row.ratio:.3f}", flush=True)
+        right = f", 1 inside {row.one_inside:.3f}, said to be needed {row.needed:.3f}" if world.is_right else ""
+        print(f"{name}: covered {row.covered:.3f}, width x{row.width:.2f}, ratio {row.ratio:.3f}{right}", flush=True)
         least = OF_FEW if world.runs <= FEW else COVERED
         if binomial_interval(round(row.covered * draws), draws, 1 - 2 * sure)[1] < least:
             yield f"{name}: intervals hold the truth in {row.covered:.1%}"
@@ -200,8 +230,17 @@ def broken(draws: int, rows: int, rng: np.random.Generator) -> Iterator[str]:
             yield f"{name}: intervals are x{row.width:.2f} as wide as the oracle's"
         if world.runs >= FROM and not 1 / NEAR < row.ratio < NEAR:
             yield f"{name}: the held-out ratio is {row.ratio:.3f}"
-        if binomial_interval(round(row.one_inside * draws), draws, 1 - 2 * sure)[1] < RIGHT:
-            yield f"{name}: a factor is invented in {1 - row.one_inside:.1%}"
+        if world.is_right and binomial_interval(round(row.one_inside * draws), draws, 1 - 2 * sure)[1] < RIGHT:
+            yield f"{name}: 1 is outside in {1 - row.one_inside:.1%}"
+        if world.is_right and binomial_interval(round(row.needed * draws), draws, 1 - 2 * sure)[0] > WRONG:
+            yield f"{name}: a factor is invented in {row.needed:.1%}"
+    for runs, rho in BY_GROUP:
+        covered = of_groups(runs, rho, draws, rng)
+        name = f"n  6, {runs:3d} runs, rho {rho:5.3f}, factors by group 4, 1, 0.25"
+        print(f"{name}: covered {covered:.3f}", flush=True)
+        least = OF_FEW if runs <= FEW else COVERED
+        if binomial_interval(round(covered * draws), draws, 1 - 2 * sure)[1] < least:
+            yield f"{name}: intervals hold the truth in {covered:.1%}"
     for make, runs, rho in product(MENDS_NONE, (30, 100), (0.0, 0.9)):
         world = World(3, runs, rho, (1.0,), spread=0.3)
         said = sum(correct(make(world, rng)).status == "consistent" for _ in range(draws))
@@ -224,7 +263,7 @@ def main() -> int:
         draws=(300, "draws a row"),
         seed=(0, "of the draws"),
     )
-    rows = len(WORLDS) + 4 * len(MENDS_NONE)
+    rows = len(WORLDS) + len(BY_GROUP) + 4 * len(MENDS_NONE)
     found = list(broken(options.draws, rows, np.random.default_rng(options.seed)))
     print("\n".join(found) or "all promises are kept")
     return int(bool(found))

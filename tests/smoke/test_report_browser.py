@@ -1,18 +1,34 @@
-"""The report opened from disk in a real browser: no error, no request, charts drawn, switches work."""
+"""The report opened from disk in a real browser: no error, no request, charts drawn, switches work.
+
+Pages of every kind are accessible, as axe-core finds them.
+"""
 
 import json
 import os
 import shutil
+import subprocess
+import sys
 import time
+from functools import partial
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import consistency as cs
 from consistency.bench.pages import write_reports
+from consistency.commands import main
 from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.document.alarms import monitor_document
+from consistency.referee.document.blocks import Chapter, Document, Figure
+from consistency.referee.pages.nis_over_time import monitor_drawing
 from consistency.referee.pages.questions import MARKS
+from consistency.referee.readers.formats.innovation_files import NisLog
+from consistency.referee.show import as_html
+from consistency.referee.verdicts.monitor_sources import make_monitor, watch
 
 pytestmark = pytest.mark.browser
+ROOT = Path(__file__).parents[2]
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -129,3 +145,85 @@ def test_nothing_runs_over_the_edge(browser, width):
         wait_for(lambda: browser.execute_script("return document.documentElement.scrollWidth") <= width, 10)
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+# --- accessibility ------------------------------------------------------------------------------------
+
+GRAVE = (
+    "moderate",
+    "serious",
+    "critical",
+)  # of axe-core's four grades; some moderate ones are serious in later versions
+GATE = """
+import numpy as np
+from consistency.testing import assert_consistent
+
+def test_it():
+    errors = 2.0 * np.random.default_rng(5).standard_normal((60, 10, 2))
+    assert_consistent(errors, np.broadcast_to(np.eye(2), (60, 10, 2, 2)))
+"""
+
+
+def gate_page(at):
+    (at / "test_gate.py").write_text(GATE)
+    command = [sys.executable, "-m", "pytest", "-q", "--consistency-report", "gate.html", "test_gate.py"]
+    subprocess.run(command, cwd=at, check=False, capture_output=True)
+    return at / "gate.html"
+
+
+def files_page(at):
+    rng = np.random.default_rng(5)
+    np.savez(
+        at / "est.npz", errors=rng.standard_normal((60, 10, 2)), covariances=np.tile(2 * np.eye(2), (60, 10, 1, 1))
+    )
+    with pytest.raises(SystemExit):
+        main(["analyse", str(at / "est.npz"), "--report", str(at / "look")])
+    return at / "look" / "report.html"
+
+
+def monitor_page(at):
+    """What `monitor` prints and its plot; a notebook shows them as a page does."""
+    nis = 3.0 * np.random.default_rng(5).chisquare(2, 200)
+    step = np.arange(200.0)
+    watched = watch(NisLog("fixes", step, 0.1 * step, nis, np.full(200, 2)), make_monitor("optimal"))
+    shown = monitor_document("fixes", watched.monitor, watched.alarm, watched.alarm_t, watched.since_t)
+    figure = Figure("NIS and evidence", "NIS over its degrees of freedom.", (partial(monitor_drawing, watched),))
+    chapter = Chapter("fixes", "Innovations of fixes", "fixes", (*shown.opening, figure))
+    page = at / "monitor.html"
+    page.write_text(as_html.render(Document("Monitor", "", (chapter,))), encoding="utf-8")
+    return page
+
+
+def reproduce_page(at):
+    """Two findings of the reference on the results of one world."""
+    world = cs.load_scenario("herath2007-stereo").variant("small", truth__steps=60)
+    results = cs.run_trials(world, ["ekf-uvd"], runs=4, seed=0, jobs=1)
+    results.write(at / "all" / "small")
+    reference = json.loads((ROOT / "reports/reference/findings.json").read_text("utf-8"))
+    (at / "all" / "findings.json").write_text(json.dumps(reference[:2]))
+    (at / "all" / "manifest.json").write_text(json.dumps(results.manifest | {"studies": ["small"]}))
+    write_reports(at / "all", at / "report.html", None, overwrite=False)
+    return at / "report.html"
+
+
+PAGES = {"files": files_page, "monitor": monitor_page, "gate": gate_page, "reproduce": reproduce_page, "study": None}
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_a_page_is_accessible(browser, report, kind, tmp_path):
+    axe = pytest.importorskip("axe_core_python.selenium").Axe()
+    make = PAGES[kind]
+    page = report if make is None else make(tmp_path)
+    first = browser.current_window_handle
+    browser.switch_to.new_window("tab")
+    try:
+        size = {"width": 420, "height": 900, "deviceScaleFactor": 1, "mobile": True}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)  # where regions scroll
+        browser.get(page.as_uri())
+        browser.execute_script("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        browser.set_script_timeout(110)
+        found = [each for each in axe.run(browser)["violations"] if each["impact"] in GRAVE]
+        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
+    finally:
+        browser.close()
+        browser.switch_to.window(first)

@@ -162,7 +162,7 @@ class Details:
     """Blocks that a reader of the page unfolds; on paper, blocks under a heading."""
 
     summary: str
-    blocks: tuple[Facts | Settings, ...]
+    blocks: tuple[Facts | Settings | Table, ...]
     whole: bool = False  # not broken between pages
 
 

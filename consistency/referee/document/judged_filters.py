@@ -30,7 +30,7 @@ from consistency.referee.document.blocks import (
     Text,
     table,
 )
-from consistency.referee.document.wording import NONE, brief, number, p_cell
+from consistency.referee.document.wording import NONE, brief, number
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
@@ -83,11 +83,11 @@ def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
 
 
 def shown_inside(v: Verdict) -> Cell:
-    """Whether the ratio of true to stated covariance was shown to lie where it should, and the p value."""
+    """Whether the ratio of true to stated covariance was shown to lie where it should."""
     shown = v.equivalence
     if shown is None or not np.isfinite(shown.p_value):
         return NONE
-    return f"{'yes' if shown.shown else 'no'}, p {p_cell(shown.p_value)}"
+    return "yes" if shown.shown else "no"
 
 
 def _rmse_position(v: Verdict) -> Quantity:
@@ -174,11 +174,8 @@ def page(inside: str) -> tuple[Measure, ...]:
     return (
         *BRIEF,
         Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), shown_inside),
-        Measure(
-            Column("Worst axis", "Worst\naxis", number=True),
-            _worst_axis,
-        ),
-        Measure(Column("Mainly", number=True), lambda v: v.subset or NONE),
+        Measure(Column("Worst axis", "Worst\naxis"), _worst_axis),
+        Measure(Column("Mainly"), lambda v: v.subset or NONE),
         Measure(
             Column("Since step", "Since\nstep", number=True),
             lambda v: str(v.location.since) if v.location and v.location.since is not None else NONE,

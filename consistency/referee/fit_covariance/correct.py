@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
@@ -18,8 +20,9 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
-from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, mean_over_runs
+from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of
 from consistency.referee.fit_covariance.floors import fit_runs
+from consistency.referee.fit_covariance.intervals import mean_over_runs
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.sources import judge_all
@@ -83,6 +86,11 @@ class Correction:
         return {group: fit for group, fit in self.fits.items() if group or len(self.fits) == 1}
 
     @property
+    def is_needed(self) -> bool:
+        """Whether any factor but 1, or floor, is shown to be needed, all of them taken together."""
+        return are_needed(tuple(self.shown.values()))
+
+    @property
     def axes(self) -> tuple[str, ...]:
         """Names of the components of the error."""
         return tuple(self.before.record.axes) or numbered_axes(self.before.record.dof)
@@ -117,9 +125,10 @@ class Correction:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import plot_correction  # draws
+        from consistency.referee.fit_covariance.page import draw_correction
+        from consistency.referee.pages.write_pages import plotted
 
-        return plot_correction(self, path)
+        return plotted(partial(draw_correction, self), path)
 
     def __repr__(self) -> str:
         from consistency.referee.fit_covariance.correction_text import sentence  # of this class
@@ -272,6 +281,13 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
     return fits | {"": whole}
 
 
+def are_needed(fits: Sequence[Fit]) -> bool:
+    """Whether a floor is kept, or a factor differs from 1 by more than chance, with Bonferroni's correction."""
+    chances = [chance for fit in fits for chance in fit.chance]
+    has_floor = any(fit.factors.floor.any() for fit in fits)
+    return has_floor or len(chances) * min(chances) <= 1.0 - CONFIDENCE
+
+
 def group_index(record: Record) -> Indices:
     """The group of each step, (runs, steps), -1 where it is in none: the place of a fit among those of the groups."""
     assert record.nees is not None
@@ -331,8 +347,7 @@ def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Rec
     for block, of_groups in zip(blocks, dof.T, strict=True):
         nu = of_groups[group_index(record)]
         places, n = list(block.places), len(block)
-        P = record.covariance[:, :, places][..., places]
-        squares = squared_length(whiten(error[..., places], P))
+        squares = squared_length(whiten(error[..., places], block.of(record.covariance)))
         known = special.chdtri(n, special.fdtrc(n, nu, squares / n))
         shorter = np.sqrt(known / np.where(squares > 0, squares, 1.0))
         error[..., places] *= np.where(np.isfinite(shorter) & (squares > 0), shorter, 1.0)[..., None]

@@ -12,8 +12,8 @@ from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
+from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.page import correction_page
-from consistency.referee.fit_covariance.writing import pairs, write_fit
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
@@ -30,7 +30,8 @@ def write_correction(
     files : that the covariances came in; without any the errors and covariances are written as archives of NumPy
     """
     write = partial(_write_runs, found, record, files)
-    texts = {"correction.toml": toml(found), "corrected_covariance.py": pasted(found)}
+    head = f"{found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component."
+    texts = {"correction.toml": toml(head, data(found)), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
@@ -39,24 +40,33 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
 
     Returns the names of what ``analyse`` reads: a file, or a folder of trajectories.
     """
-    groups = record.groups
     numbers = dict(zip(found.runs, record.run_numbers.tolist(), strict=True))
-    judged = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
-    every = dict.fromkeys(numbers.values(), by_group(found.fits))
-    for name, of_runs in ((HELD_OUT, judged), (CORRECTED, every)):
-        at = folder / name
-        at.mkdir()
-        pieces = record.unit != "run" and name == HELD_OUT
-        if not files or pieces or (groups is not None and any(file.by_column is None for file in files)):
-            _write_archive(at / f"{found.name}.npz", record, of_runs)
-            continue
-        of_files = every if record.unit == "run" else dict.fromkeys((file.run for file in files), by_group(found.fits))
-        change = partial(_change, found.axes, groups, judged if name == HELD_OUT else of_files)
-        for file in files:
-            if file.run_column is not None or change(file.run, "") is not None:
-                (at / file.path.name).write_text(file.restated(change), encoding="utf-8")
-    made = [(name, [path.name for path in (folder / name).iterdir()]) for name in (HELD_OUT, CORRECTED)]
-    return [f"{name}/{files[0]}" if len(files) == 1 else name for name, files in made]
+    held_out = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
+    groups = record.groups
+    is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
+    are_runs = record.unit == "run"  # pieces of one log are not in its file
+    runs = numbers.values() if are_runs else [file.run for file in files]
+    corrected = dict.fromkeys(runs if is_text else numbers.values(), by_group(found.fits))
+    return [
+        _write_one(folder / HELD_OUT, found, record, files if is_text and are_runs else (), held_out),
+        _write_one(folder / CORRECTED, found, record, files if is_text else (), corrected),
+    ]
+
+
+def _write_one(
+    folder: Path, found: Correction, record: Record, files: Sequence[TextFile], of_runs: dict[int, ByGroup]
+) -> str:
+    """Write runs by their factors, as text or as an archive; the name of the file, or of the folder of several."""
+    folder.mkdir()
+    if not files:
+        _write_archive(folder / f"{found.name}.npz", record, of_runs)
+        return f"{folder.name}/{found.name}.npz"
+    change = partial(_change, found.axes, record.groups, of_runs)
+    for file in files:
+        if file.run_column is not None or file.run in of_runs:
+            (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
+    made = [path.name for path in folder.iterdir()]
+    return f"{folder.name}/{made[0]}" if len(made) == 1 else folder.name
 
 
 def _change(
@@ -104,23 +114,6 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
 
 
 # --- lines for other programs -----------------------------------------------------------------------------------------
-
-
-def toml(found: Correction) -> str:
-    """correction.toml: factors with their intervals, and the data that they hold for."""
-    known = data(found)
-    del known["referee"]
-    blocks = known.pop("blocks")
-    tables = {key: known.pop(key) for key in ("stated", "corrected")}
-    lines = [
-        f"# {found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component.",
-        *pairs(known),
-    ]
-    for key, values in tables.items():
-        lines += ["", f"[{key}]", *pairs(values)]
-    for block in blocks:
-        lines += ["", "[[blocks]]", *pairs(block)]
-    return "\n".join(lines) + "\n"
 
 
 def pasted(found: Correction) -> str:

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Table, Text, table
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
-from consistency.referee.fit_covariance.covariance_ratios import IN_TURN
+from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, shown
 
 UNITS = {"position": " m", "attitude": " rad", "velocity": " m/s"}
 
@@ -31,17 +32,9 @@ def sentence(found: Correction) -> str:
         parts.append(decided_by)
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
-    fits = found.shown.values()
-    if all(each.holds(1.0) for fit in fits for each in fit.factor) and not any(fit.factors.floor.any() for fit in fits):
-        parts.append("no factor is shown to be needed: 1 lies in every interval")
+    elif not found.is_needed:
+        parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
     return "; ".join(parts)
-
-
-def shown(interval: Interval) -> str:
-    """A ratio with its interval."""
-    if not np.isfinite(interval.high):
-        return short(interval.value)
-    return f"{short(interval.value)} [{short(interval.low)}, {short(interval.high)}]"
 
 
 def correction_document(found: Correction) -> Document:

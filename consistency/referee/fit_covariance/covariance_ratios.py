@@ -6,10 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
-from consistency.referee.defaults import CONFIDENCE, DETECT
+from consistency.referee.defaults import DETECT
+from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.intervals import mean_over_runs
 from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.readers.places import listed
@@ -181,28 +184,29 @@ def ratio_of(
     """
     known = np.isfinite(by_drive) & (by_drive > 0)
     drives = int(known.sum())
-    center = reach = spread = float("nan")
+    spread = reach = float("nan")
+    center = float("nan")
     if drives > 1:
         logs = np.log(by_drive[known])
         if dof is not None:
             half = 0.5 * dof[known]
             logs += np.log(half) - special.digamma(half)
-        center = float(logs.mean())
-        spread = float(logs.std(ddof=1))
-        reach = _student(drives) * spread / np.sqrt(drives)
+        center, _, high = mean_over_runs(logs)
+        spread, reach = float(logs.std(ddof=1)), high - center
     elif drives == 1:
-        center = float(np.log(values.mean()))
+        mean = float(values.mean())
         parts = np.array_split(values, min(BLOCKS, len(values)))
-        reach = np.inf
-        if len(parts) > 1:
-            means = np.array([part.mean() for part in parts])
-            error = means.std(ddof=1) / np.sqrt(len(means))
-            reach = _student(len(means)) * error / means.mean()
+        middle, _, high = mean_over_runs(np.array([part.mean() for part in parts]))
+        center, reach = np.log(mean), (high - middle) / middle
+        if len(parts) == 1:
+            reach = np.inf
     low = float(np.exp(center - reach))
     high = float(np.exp(np.minimum(center + reach, 700.0)))
     return Ratio(float(np.exp(center)), low, high, spread, drives, len(values), general)
 
 
-def _student(k: int) -> float:
-    """Reach of an interval of the mean of k values, in standard errors."""
-    return float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1))
+def shown(ratio: Ratio | Interval) -> str:
+    """A ratio with its interval, where that is known."""
+    if not np.isfinite([ratio.low, ratio.high]).all():
+        return short(ratio.value)
+    return f"{short(ratio.value)} [{short(ratio.low)}, {short(ratio.high)}]"

@@ -10,13 +10,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
-from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.white_noise import interval_of_ratio
+from consistency.referee.fit_covariance.intervals import chance_of_one, dof_of_ratio, interval_of_ratio
 from consistency.referee.types import Array
 
 KINDS = {
@@ -40,6 +38,11 @@ class Block:
     def __len__(self) -> int:
         return len(self.places)
 
+    def of(self, P: Array) -> Array:
+        """The covariances of its components, of covariances (..., n, n)."""
+        places = list(self.places)
+        return P[..., places, :][..., places]
+
 
 @dataclass(frozen=True)
 class Factors:
@@ -51,18 +54,22 @@ class Factors:
 
     def of_components(self) -> tuple[Array, Array]:
         """Factor and floor of each component of the error, (n,) both."""
-        n = sum(map(len, self.blocks))
-        factor, floor = np.ones(n), np.zeros(n)
-        for block, s, f in zip(self.blocks, self.factor, self.floor, strict=True):
-            factor[list(block.places)] = s
-            floor[list(block.places)] = f
-        return factor, floor
+        shares = members(self.blocks)
+        return self.factor @ shares, self.floor @ shares
 
     def applied(self, P: Array) -> Array:
         """Corrected covariances of stated ones, (..., n, n)."""
         factor, floor = self.of_components()
         d = np.sqrt(factor)
         return np.asarray(P * np.outer(d, d) + np.diag(floor))
+
+
+def members(blocks: Sequence[Block]) -> Array:
+    """Which components each block has, (B, n), 1 or 0."""
+    found = np.zeros((len(blocks), sum(map(len, blocks))))
+    for b, block in enumerate(blocks):
+        found[b, list(block.places)] = 1.0
+    return found
 
 
 def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
@@ -94,10 +101,7 @@ def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
     Q = np.full((len(record.run_numbers), len(blocks), len(blocks)), np.nan)
     for run, (error, P) in enumerate(steps_of_runs(record)):
         if len(error):
-            parts = np.zeros((*error.shape, len(blocks)))
-            for b, block in enumerate(blocks):
-                places = list(block.places)
-                parts[:, places, b] = error[:, places]
+            parts = error[..., None] * members(blocks).T
             Q[run] = np.mean(np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts), axis=0)
     return Q
 
@@ -152,6 +156,7 @@ class Fit:
     factor: tuple[Interval, ...]  # (B,), before any term was dropped
     floor: tuple[Interval, ...]  # (B,)
     dof: Array  # (B,), degrees of freedom with which a factor is known
+    chance: tuple[float, ...]  # (B,), of a factor as far from 1, without floors, where the right one is 1
     notes: tuple[str, ...] = ()
 
 
@@ -162,37 +167,26 @@ def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
     factor = fit_factors(Q.mean(axis=0), sizes)
     left_out = fit_factors(without_each(Q), sizes)
     none = np.zeros(len(blocks))
+    values = list(zip(factor.tolist(), left_out.T, strict=True))
     return Fit(
         Factors(blocks, factor, none),
         tuple(Factors(blocks, each, none) for each in left_out),
-        tuple(interval_of_ratio(float(value), left_out[:, b]) for b, value in enumerate(factor)),
+        tuple(interval_of_ratio(*value) for value in values),
         (Interval(0.0, 0.0, 0.0),) * len(blocks),
         known_dof(left_out, sizes),
+        tuple(chance_of_one(*value) for value in values),
     )
 
 
 def known_dof(left_out: Array, sizes: Array) -> Array:
     """Degrees of freedom with which factors (R, B), each without a run, are known where R - 1 runs are fitted.
 
-    A factor spreads as chi-square(nu) / nu, whose logarithm has a variance of 2 / nu. It is at least that of runs whose
-    steps are all the same.
+    They are at least those of runs whose steps are all the same.
     """
-    fitted = len(left_out) - 1
-    variance = fitted * np.log(left_out).var(axis=0)
-    return np.asarray(np.maximum(2.0 / np.maximum(variance, 1e-12), fitted * sizes))
+    return np.asarray(np.maximum(dof_of_ratio(left_out), (len(left_out) - 1) * sizes))
 
 
 def run_score(C: Array, error: Array) -> float:
     """Log density of a step, mean over errors (k, n) of a run with covariances C (k, n, n)."""
     squares = (error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1)
     return float(-0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * C)[1]).mean())
-
-
-def mean_over_runs(values: Array) -> Interval:
-    """Mean of a value of each run, (R,), with Student's interval; of one run its ends are NaN."""
-    mean = float(values.mean())
-    if len(values) < 2:
-        return Interval(mean, float("nan"), float("nan"))
-    error = values.std(ddof=1) / np.sqrt(len(values))
-    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), len(values) - 1) * error)
-    return Interval(mean, mean - reach, mean + reach)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
-from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.fit_covariance.factors import (
@@ -17,15 +14,16 @@ from consistency.referee.fit_covariance.factors import (
     Fit,
     fit_alone,
     known_dof,
-    mean_over_runs,
+    members,
     run_score,
     steps_of_runs,
 )
-from consistency.referee.fit_covariance.white_noise import interval_of, interval_of_ratio, nonnegative
+from consistency.referee.fit_covariance.intervals import floor_interval, mean_over_runs
+from consistency.referee.fit_covariance.scoring import Score, maximise, nonnegative, score_of
 from consistency.referee.types import Array, Indices
 
 ALIKE = 0.98  # squared cosine between a stated covariance and a floor, from which data do not tell one from the other
-STEPS, CLOSE = 60, 1e-9  # of scoring; gain of the log likelihood of a step at which it ends
+CLOSE = 1e-9  # gain of the log likelihood of a step at which scoring ends
 LEAST = 1e-9  # of its value with no floor, that a factor has
 SAME = "the stated covariance hardly varies, or has the shape of a floor, so that factor and floor cannot be told apart"
 
@@ -65,10 +63,9 @@ def likeness(record: Record, block: Block) -> float:
 
     1 where each covariance is the same multiple of the identity.
     """
-    places = list(block.places)
     first, second = [], []
     for _, P in steps_of_runs(record):
-        inverse = np.linalg.inv(P[:, places][:, :, places])
+        inverse = np.linalg.inv(block.of(P))
         first.append(np.trace(inverse, axis1=1, axis2=2).mean())
         second.append((inverse**2).sum(axis=(1, 2)).mean())
     return float(np.mean(first) ** 2 / (len(block) * np.mean(second)))
@@ -78,119 +75,79 @@ def likeness(record: Record, block: Block) -> float:
 
 
 def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
-    """Fit factors and the floors of some blocks, beginning with the factors ``alone``.
+    """Fit factors and the floors of some blocks by scoring, beginning with the factors ``alone``.
 
-    Scoring, as in :func:`~consistency.referee.fit_covariance.white_noise.fit_terms`, with runs of the same weight. What
-    is fitted without a run is one step of scoring from the fit of all.
+    Runs have the same weight. What is fitted without a run is one step of scoring from the fit of all.
     """
-    blocks, start = alone.factors.blocks, alone.factors.factor
-    theta = np.append(start, np.zeros(len(free)))
-    value, g, H = scores(record, blocks, free, theta)
-    for _ in range(STEPS):
-        target = nonnegative(H.sum(axis=0), g.sum(axis=0) + H.sum(axis=0) @ theta)
-        target[: len(start)] = np.maximum(target[: len(start)], LEAST * start)
-        step, gain = 1.0, -np.inf
-        while gain < 0 and step >= 1e-3:
-            trial = theta + step * (target - theta)
-            tried = scores(record, blocks, free, trial)
-            gain = float(tried[0].mean() - value.mean())
-            step *= 0.5
-        if gain > 0:
-            theta, (value, g, H) = trial, tried
-        if gain < CLOSE:
-            break
-    B, p = len(blocks), len(theta)
-    without_g, without_H = g.sum(axis=0) - g, H.sum(axis=0) - H
-    open_steps = theta + np.linalg.solve(without_H, without_g[..., None])[..., 0]  # which may lead below 0
-    open_step = theta + np.linalg.solve(H.sum(axis=0), g.sum(axis=0))
-    left_out = np.array([nonnegative(h, b + h @ theta) for h, b in zip(without_H, without_g, strict=True)])
-    left_out[:, :B] = np.maximum(left_out[:, :B], LEAST * alone.factors.factor)
-    factors = [_factors(blocks, free, each) for each in (theta, *left_out)]
+    blocks = alone.factors.blocks
+    B = len(blocks)
+    start = np.append(alone.factors.factor, np.zeros(len(free)))
+    least = LEAST * start
+
+    def score(theta: Array) -> Score:
+        return Score(*(part.sum(axis=0) for part in scores(record, blocks, free, theta)))
+
+    theta = maximise(score, start, least, CLOSE * len(alone.left_out))
+    _, gradients, informations = scores(record, blocks, free, theta)
+    g, H = gradients.sum(axis=0), informations.sum(axis=0)
+    open_value = theta + np.linalg.solve(H, g)  # which may lie below 0
+    open_left_out = theta + np.linalg.solve(H - informations, (g - gradients)[..., None])[..., 0]
+    left_out, intervals = [], []
+    for of_run, information in zip(gradients, informations, strict=True):
+        rest = H - information
+        at = np.maximum(nonnegative(rest, g - of_run + rest @ theta), least)
+        left_out.append(with_parameters(blocks, free, at))
+    for i, value in enumerate(theta.tolist()):
+        inside = value if value > 2.0 * least[i] else 0.0
+        interval = floor_interval(inside, float(open_value[i]), open_left_out[:, i])
+        intervals.append(interval._replace(value=value))
     floors = [Interval(0.0, 0.0, 0.0)] * B
-    for i, b in zip(range(B, p), free, strict=True):
-        floors[b] = floor_interval(theta[i], open_step[i], open_steps[:, i])
-    intervals = []
-    for b, factor in enumerate(theta[:B].tolist()):
-        if open_steps[:, b].min() > LEAST * start[b]:
-            intervals.append(interval_of_ratio(factor, open_steps[:, b]))
-        else:  # a factor that may be 0, so that the floor stands alone
-            center = factor if factor > 2.0 * LEAST * start[b] else 0.0
-            intervals.append(floor_interval(center, open_step[b], open_steps[:, b])._replace(value=factor))
-    return Fit(
-        factors[0],
-        tuple(factors[1:]),
-        tuple(intervals),
-        tuple(floors),
-        known_dof(relative_sizes(record, factors[0], factors[1:]), np.array([len(block) for block in blocks])),
+    for i, b in enumerate(free):
+        floors[b] = intervals[B + i]
+    factors = with_parameters(blocks, free, theta)
+    sizes = np.array([len(block) for block in blocks], float)
+    dof = known_dof(relative_sizes(record, factors, left_out), sizes)
+    return replace(
+        alone, factors=factors, left_out=tuple(left_out), factor=tuple(intervals[:B]), floor=tuple(floors), dof=dof
     )
 
 
-def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
-    """Log likelihood of a step but for its constant, its gradient and expected information, means of each run.
-
-    Shapes (R,), (R, p) and (R, p, p), for p parameters: a factor of each block, then the floors of those that are free.
-    """
-    factors = _factors(blocks, free, theta)
-    found = []
-    for error, P in steps_of_runs(record):
-        C = factors.applied(P)
-        inverse = np.linalg.inv(C)
-        u = (inverse @ error[..., None])[..., 0]
-        F = _derivatives(C, factors, free)
-        G = inverse[:, None] @ F
-        flat = G.reshape(*G.shape[:2], -1)
-        turned = np.swapaxes(G, -1, -2).reshape(flat.shape)
-        information = 0.5 * np.tensordot(flat, turned, ((0, 2), (0, 2)))
-        gradient = 0.5 * (np.einsum("ki,kpij,kj->p", u, F, u, optimize=True) - np.einsum("kpii->p", G))
-        value = -0.5 * float((error * u).sum() + np.linalg.slogdet(C)[1].sum())
-        found.append((value / len(error), gradient / len(error), information / len(error)))
-    values, gradients, informations = zip(*found, strict=True)
-    return np.array(values), np.array(gradients), np.array(informations)
-
-
-def _derivatives(C: Array, factors: Factors, free: Indices) -> Array:
-    """Derivatives (k, p, n, n) of corrected covariances C (k, n, n) by factors and floors."""
-    n = C.shape[-1]
-    scaled = C - np.diag(factors.of_components()[1])
-    found = []
-    for block, factor in zip(factors.blocks, factors.factor, strict=True):
-        rows = np.zeros((n, 1))
-        rows[list(block.places)] = 0.5 / factor
-        found.append(rows * scaled + scaled * rows.T)
-    for b in free:
-        own = np.zeros(n)
-        own[list(factors.blocks[b].places)] = 1.0
-        found.append(np.broadcast_to(np.diag(own), C.shape))
-    return np.stack(found, axis=1)
-
-
-def relative_sizes(record: Record, whole: Factors, others: Sequence[Factors]) -> Array:
-    """Corrected variances of each block by other factors, over those by ``whole``, (others, B)."""
-    sizes = np.empty((len(others), len(whole.blocks)))
-    for b, block in enumerate(whole.blocks):
-        places = list(block.places)
-        inverses = (np.linalg.inv(whole.applied(P)[:, places][:, :, places]) for _, P in steps_of_runs(record))
-        traces = [np.trace(inverse, axis1=1, axis2=2).mean() for inverse in inverses]
-        share = float(np.mean(traces)) * whole.floor[b] / len(block)  # of the floor
-        floor = max(whole.floor[b], 1e-300)
-        sizes[:, b] = [
-            (1.0 - share) * each.factor[b] / whole.factor[b] + share * each.floor[b] / floor for each in others
-        ]
-    return sizes
-
-
-def _factors(blocks: tuple[Block, ...], free: Indices, theta: Array) -> Factors:
+def with_parameters(blocks: tuple[Block, ...], free: Indices, theta: Array) -> Factors:
+    """A factor of each block, and the floors of those that are free, from parameters (p,) in this order."""
     floor = np.zeros(len(blocks))
     floor[free] = theta[len(blocks) :]
     return Factors(blocks, theta[: len(blocks)], floor)
 
 
-def floor_interval(value: float, open_value: float, left_out: Array) -> Interval:
-    """Interval of a floor from its values with each run left out, which may lie below 0; one-sided at 0."""
-    if value > 0.0 and left_out.min() > 0.0:
-        return interval_of(float(value), left_out)
-    k = len(left_out)
-    error = float(np.sqrt(k - 1) * left_out.std())
-    tail = 1.0 - CONFIDENCE if value == 0.0 else 0.5 * (1.0 - CONFIDENCE)
-    reach = float(stats.t.isf(tail, k - 1)) * error
-    return Interval(float(value), max(float(value) - reach, 0.0), max(float(open_value), 0.0) + reach)
+def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
+    """The score of a step, mean of each run: shapes (R,), (R, p) and (R, p, p)."""
+    factors = with_parameters(blocks, free, theta)
+    found = []
+    for error, P in steps_of_runs(record):
+        C = factors.applied(P)
+        of_run = score_of(error, C, derivatives(C, factors, free))
+        found.append([part / len(error) for part in of_run])
+    values, gradients, informations = map(np.array, zip(*found, strict=True))
+    return values, gradients, informations
+
+
+def derivatives(C: Array, factors: Factors, free: Indices) -> Array:
+    """Derivatives (k, p, n, n) of corrected covariances C (k, n, n) by factors and floors."""
+    n = C.shape[-1]
+    own = members(factors.blocks)
+    rates = 0.5 * own / factors.factor[:, None]  # of the square root of a factor, over it
+    scaled = C - np.diag(factors.of_components()[1])
+    by_factor = (rates[:, :, None] + rates[:, None, :]) * scaled[:, None]
+    by_floor = np.broadcast_to(own[free, :, None] * np.eye(n), (len(C), len(free), n, n))
+    return np.concatenate([by_factor, by_floor], axis=1)
+
+
+def relative_sizes(record: Record, whole: Factors, others: list[Factors]) -> Array:
+    """Corrected variances of each block by other factors, over those by ``whole``, (others, B)."""
+    precision = np.empty(len(whole.blocks))
+    for b, block in enumerate(whole.blocks):
+        inverses = [np.linalg.inv(block.of(whole.applied(P))) for _, P in steps_of_runs(record)]
+        precision[b] = np.mean([np.trace(each, axis1=1, axis2=2).mean() for each in inverses]) / len(block)
+    factor = np.array([each.factor for each in others]) / whole.factor
+    floor = np.array([each.floor for each in others])
+    return np.asarray(factor * (1.0 - whole.floor * precision) + floor * precision)

@@ -11,7 +11,7 @@ from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
-from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio
+from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio, shown
 from consistency.referee.fit_covariance.mean_by_motion import MotionDependence
 from consistency.referee.fit_covariance.motion_windows import ENOUGH, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
@@ -29,18 +29,12 @@ def sentence(model: NoiseModel) -> str:
     word = model.status
     if word == "consistent":
         word = f"consistent within x{DETECT:g}"
-    parts = [f"at {_text(model.span)} {word}: held-out ratio {_shown(model.ratio)}", _basis(model), *_reasons(model)]
+    parts = [f"at {_text(model.span)} {word}: held-out ratio {shown(model.ratio)}", _basis(model), *_reasons(model)]
     return "; ".join(parts)
 
 
 def _text(span: str) -> str:
     return span_of(span).text
-
-
-def _shown(ratio: Ratio) -> str:
-    if not np.isfinite(ratio.low):
-        return short(ratio.value)
-    return f"{short(ratio.value)} [{short(ratio.low)}, {short(ratio.high)}]"
 
 
 def _basis(model: NoiseModel) -> str:
@@ -183,7 +177,7 @@ def _table(model: NoiseModel) -> Table:
 def _cell(ratio: Ratio) -> Cell:
     if not np.isfinite(ratio.low):
         return Quantity(ratio.value)
-    return _shown(ratio) + MARK[ratio.status]
+    return shown(ratio) + MARK[ratio.status]
 
 
 def noise_lines(model: NoiseModel) -> Iterator[str]:

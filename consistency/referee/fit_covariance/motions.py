@@ -83,16 +83,14 @@ def write_motions(stretches: Sequence[Stretch], folder: Path) -> list[str]:
 
 def _write_tables(stretches: Sequence[Stretch], folder: Path) -> None:
     """Two tables, with a clock where all stretches have one."""
-    runs = np.concatenate([np.full(len(each.t), each.run) for each in stretches])
-    keys = np.column_stack([runs, np.concatenate([each.rows for each in stretches])])
-    times = np.concatenate([each.t for each in stretches])
-    head = ["run", "step", "x", "y", "heading"]
-    if np.isfinite(times).all():
-        head.insert(2, "t")
-        keys = np.column_stack([keys, times])
-    P = np.concatenate([each.covariance for each in stretches])
-    stated = np.column_stack([P[:, i, j] for i, j in COVARIANCE.values()])
-    motions = np.column_stack([keys, np.concatenate([each.estimate for each in stretches]), stated])
-    truth = np.column_stack([keys, np.concatenate([each.truth for each in stretches])])
-    for name, columns, numbers in (("motions", [*head, *COVARIANCE], motions), ("truth", head, truth)):
-        np.savetxt(folder / f"{name}.csv", numbers, DIGITS, ",", header=",".join(columns), comments="")
+    motions, truth = [], []
+    for each in stretches:
+        keys = np.column_stack([np.full(len(each.t), each.run), each.rows, each.t])
+        stated = [each.covariance[:, i, j] for i, j in COVARIANCE.values()]
+        motions.append(np.column_stack([keys, each.estimate, *stated]))
+        truth.append(np.column_stack([keys, each.truth]))
+    head = np.array(["run", "step", "t", "x", "y", "heading", *COVARIANCE])
+    for name, rows in (("motions", np.concatenate(motions)), ("truth", np.concatenate(truth))):
+        known = ~np.isnan(rows).any(axis=0)
+        columns = ",".join(head[: len(known)][known])
+        np.savetxt(folder / f"{name}.csv", rows[:, known], DIGITS, ",", header=columns, comments="")

@@ -126,9 +126,10 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import plot_noise  # draws
+        from consistency.referee.fit_covariance.page import draw_noise
+        from consistency.referee.pages.write_pages import plotted
 
-        return plot_noise(self, path)
+        return plotted(partial(draw_noise, self), path)
 
     def __repr__(self) -> str:
         from consistency.referee.fit_covariance.model_text import sentence  # of this class

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +20,6 @@ from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.fit_covariance.white_noise import nees_of
-from consistency.referee.pages.write_pages import plotted
 from consistency.referee.show.painting import (
     canvas,
     curve,
@@ -47,10 +45,14 @@ CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
+def page_of(said: Document, figures: tuple[Figure, ...]) -> Document:
+    """A document with its pictures."""
+    return replace(said, chapters=(Chapter("", "", "", figures),))
+
+
 def noise_page(model: NoiseModel) -> Document:
     """What the model says, and its pictures."""
-    said = noise_document(model)
-    return Document(said.title, "", (Chapter("", "", "", noise_figures(model)),), said.opening, said.data)
+    return page_of(noise_document(model), noise_figures(model))
 
 
 def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
@@ -64,17 +66,12 @@ def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
         "span alone (lines); and the ratio of true to stated covariance of each judged drive."
     )
     return (
-        Figure("Errors of motions", errors, (partial(_draw, model, above=True),)),
-        Figure("Growth and ratios", growth, (partial(_draw, model, below=True),)),
+        Figure("Errors of motions", errors, (partial(draw_noise, model, below=False),)),
+        Figure("Growth and ratios", growth, (partial(draw_noise, model, above=False),)),
     )
 
 
-def plot_noise(model: NoiseModel, at: str | Path | None) -> Drawing:
-    """All panels in one figure of Matplotlib; see :meth:`NoiseModel.plot`."""
-    return plotted(partial(_draw, model, above=True, below=True), at)
-
-
-def _draw(model: NoiseModel, above: bool = False, below: bool = False) -> Drawing:
+def draw_noise(model: NoiseModel, above: bool = True, below: bool = True) -> Drawing:
     """Errors of the first spans, a panel each, and below them growth and drives."""
     spans = model.spans[:SHOWN]
     axes = range(len(model.noise.axes))
@@ -149,42 +146,45 @@ def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
 
 def correction_page(found: Correction) -> Document:
     """What a correction says, and its pictures."""
-    said = correction_document(found)
     caption = (
         "Ratio of true to stated covariance of each held-out run, as stated and corrected; the factor of each block "
         "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
     )
     figure = Figure("Held-out runs, factors and coverage", caption, (partial(draw_correction, found),))
-    return Document(said.title, "", (Chapter("", "", "", (figure,)),), said.opening, said.data)
-
-
-def plot_correction(found: Correction, at: str | Path | None) -> Drawing:
-    """The pictures of a correction as a figure of Matplotlib; see :meth:`Correction.plot`."""
-    return plotted(partial(draw_correction, found), at)
+    return page_of(correction_document(found), (figure,))
 
 
 def draw_correction(found: Correction) -> Drawing:
     """Ratios of held-out runs, factors, and coverage."""
     figure, (runs, factors, coverage) = canvas(2.4, 3, 3)
-    both = (found.before, found.after)
-    ratios = [one.ratios for one in both]
-    shown = np.linspace(0, len(ratios[0]) - 1, min(MOST_ROWS, len(ratios[0]))).round().astype(int)
-    draw_ratios(runs, [found.judged[i] for i in shown], *(each[shown] for each in ratios))
+    ratios = found.before.ratios, found.after.ratios
+    rows = np.linspace(0, len(found.judged) - 1, min(MOST_ROWS, len(found.judged))).round().astype(int)
+    draw_ratios(runs, np.array(found.judged)[rows], *(each[rows] for each in ratios))
     log_axis(runs, "x")
+    _draw_factors(factors, found)
+    _draw_coverage(coverage, found)
+    return figure
+
+
+def _draw_factors(axes: Axes, found: Correction) -> None:
+    """The factor of each block with its interval, a row for each."""
     names = [f"{group} {block.name}".strip() for group in found.shown for block in found.blocks]
-    name_rows(factors, names)
-    factors.axvline(1.0, **stroke(EXPECTED))
     values = np.array([factor for fit in found.shown.values() for factor in fit.factor])
     high = values[:, 2].max()
     low = max(values[:, 1].min(), 1e-3 * high)  # a factor may be 0
-    factors.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
-    intervals(factors, np.arange(len(names), dtype=float), values, style(1))
-    log_axis(factors, "x")
-    factors.set(xlabel="factor on variances")
+    name_rows(axes, names)
+    axes.axvline(1.0, **stroke(EXPECTED))
+    axes.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
+    intervals(axes, np.arange(len(names), dtype=float), values, style(1))
+    log_axis(axes, "x")
+    axes.set(xlabel="factor on variances")
+
+
+def _draw_coverage(axes: Axes, found: Correction) -> None:
+    """Share of held-out errors inside the ellipsoid of each probability."""
     levels = np.linspace(0.01, 0.99, 50)
-    coverage.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
-    for number, label in enumerate(("stated", "corrected")):
-        curve(coverage, levels, both[number].covered(levels), solid(style(number)), label)
-    coverage.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
-    panel_legend(coverage)
-    return figure
+    axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
+    curve(axes, levels, found.before.covered(levels), solid(style(0)), "stated")
+    curve(axes, levels, found.after.covered(levels), solid(style(1)), "corrected")
+    axes.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
+    panel_legend(axes)

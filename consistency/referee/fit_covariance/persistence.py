@@ -175,23 +175,15 @@ def errors_of_second(noise: WhiteNoise, windows: DriveWindows, second: Sequence[
         true = windows.true[rows[both]]
         if estimated.shape[1:] != true.shape[1:]:
             raise InputError("--second: needs poses of the same kind, in the plane or in space")
+        errors = log(inverse(estimated) @ true)
         first.append(corrected[rows[both]])
-        other.append(_centered(log(inverse(estimated) @ true)))
-    a = np.concatenate(first)
-    b = np.concatenate(other)
+        other.append(errors - errors.mean(axis=0) if len(errors) else errors)
+    a, b = np.concatenate(first), np.concatenate(other)
     if len(a) < FEWEST:
         raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
-    a = _centered(a)
-    b = _centered(b)
-    size = np.maximum(np.sqrt(mean_square(a)), 1e-300)
-    size_of_second = np.maximum(np.sqrt(mean_square(b)), 1e-300)
-    correlation = (a * b).mean(axis=0) / (size * size_of_second)
-    return SecondErrors(correlation, size_of_second / size)
-
-
-def _centered(error: Array) -> Array:
-    """Errors (W, n) less their mean."""
-    return error - error.mean(axis=0) if len(error) else error
+    size, size_of_second = (np.maximum(each.std(axis=0), 1e-300) for each in (a, b))
+    covariance = ((a - a.mean(axis=0)) * (b - b.mean(axis=0))).mean(axis=0)
+    return SecondErrors(covariance / (size * size_of_second), size_of_second / size)
 
 
 def _same_drive(drive: Drive, second: Sequence[Drive], drives: int) -> Drive:
@@ -210,7 +202,6 @@ def _rows_at(twin: Drive, drive: Drive, rows: Indices) -> Indices:
     if not (np.isfinite(own).all() and np.isfinite(other).all()):
         own, other = drive.row.astype(float), twin.row.astype(float)
     at = own[rows]
-    near = np.clip(np.searchsorted(other, at), 1, len(other) - 1)
-    near = near - (at - other[near - 1] < other[near] - at)
+    near = np.searchsorted(0.5 * (other[1:] + other[:-1]), at)
     period = 0.51 * float(np.median(np.diff(other)))
     return np.where(np.abs(other[near] - at) <= period, near, -1)

@@ -5,16 +5,15 @@ The variances are fitted to the errors of windows by maximum likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, stats
 
-from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.intervals import interval_of
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
+from consistency.referee.fit_covariance.scoring import maximise, score_of
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
@@ -32,7 +31,7 @@ ROUNDS = 2  # of mean and noise in turn, before the mean is told from none
 SHOWN = 3.0  # standard errors from which there is jitter
 SHORTER = (8.0, 4.0, 2.0, 1.0)  # parts of the span, whose errors tell jitter of both ends from noise of the way
 LENGTHS = 3  # that tell it
-STEPS, CLOSE = 100, 1e-7  # of scoring; gain of the log likelihood of a window at which it ends
+CLOSE = 1e-7  # gain of the log likelihood of a window at which scoring ends
 
 
 @dataclass(frozen=True)
@@ -214,27 +213,6 @@ def variance_intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interv
     return tuple(interval_of(*term) for term in terms)
 
 
-def interval_of(value: float, left_out: Sequence[float] | Array) -> Interval:
-    """Interval of a variance from its values with each block left out, in cube roots (Wilson & Hilferty 1931)."""
-    roots = np.cbrt(np.asarray(left_out))
-    k = len(roots)
-    error = float(np.sqrt(k - 1) * roots.std())
-    if not error > 0:  # 0 with any block left out: its upper end is not known
-        return Interval(value, 0.0, float("nan"))
-    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1)) * error
-    root = float(np.cbrt(value))
-    return Interval(value, max(root - reach, 0.0) ** 3, (root + reach) ** 3)
-
-
-def interval_of_ratio(value: float, left_out: Array) -> Interval:
-    """Interval of a positive ratio from its values with each run left out (k,): Student's, of its logarithm."""
-    logs = np.log(left_out)
-    k = len(logs)
-    reach = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1) * np.sqrt(k - 1) * logs.std())
-    factor = float(np.exp(min(reach, 700.0)))
-    return Interval(value, value / factor, value * factor)
-
-
 # --- maximum likelihood -----------------------------------------------------------------------------------------------
 
 
@@ -276,34 +254,10 @@ def fit_terms(
     F : (W, p, n, n)
     floor : (n,), variances that are there in any case
     """
-    theta = _start(error, F) if start is None else np.maximum(start, 1e-12 * start.max())
-    value = likelihood(error, sum_of_terms(theta, F, floor))
-    for _ in range(STEPS):
-        target = _target(error, F, floor, theta)
-        step, gain = 1.0, -np.inf
-        while gain < 0 and step >= 5e-4:
-            trial = theta + step * (target - theta)
-            gain = likelihood(error, sum_of_terms(trial, F, floor)) - value
-            step *= 0.5
-        if gain > 0:
-            theta = trial
-            value += gain
-        if gain < CLOSE * len(error):
-            break
-    return theta
-
-
-def _target(error: Array, F: Array, floor: Array, theta: Array) -> Array:
-    """Where a step of scoring leads to from theta, (p,)."""
-    inverse = np.linalg.inv(sum_of_terms(theta, F, floor))
-    G = inverse[:, None] @ F  # (W, p, n, n)
-    flat = G.reshape(*G.shape[:2], -1)
-    turned = np.swapaxes(G, -1, -2).reshape(flat.shape)
-    H = np.tensordot(flat, turned, ((0, 2), (0, 2)))
-    u = (inverse @ error[..., None])[..., 0]
-    of_errors = np.einsum("wi,wpij,wj->p", u, F, u, optimize=True)
-    of_floor = np.einsum("wpij,wji->p", G, inverse * floor, optimize=True)
-    return nonnegative(H, of_errors - of_floor)
+    theta = np.maximum(start, 1e-12 * start.max()) if start is not None else _start(error, F)
+    return maximise(
+        lambda variances: score_of(error, sum_of_terms(variances, F, floor), F), theta, 0.0, CLOSE * len(error)
+    )
 
 
 def _start(error: Array, F: Array) -> Array:
@@ -314,25 +268,7 @@ def _start(error: Array, F: Array) -> Array:
     return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
 
 
-def likelihood(error: Array, C: Array) -> float:
-    """Log density of the errors but for its constant; -inf where a covariance is not positive definite."""
-    sign, logdet = np.linalg.slogdet(C)
-    if not (sign > 0).all():
-        return -np.inf
-    return float(-0.5 * (logdet.sum() + nees_of(error, C).sum()))
-
-
 def nees_of(error: Array, C: Array) -> Array:
     """e' C^-1 e, (W,)."""
     solved = np.linalg.solve(C, error[..., None])[..., 0]
     return np.asarray((error * solved).sum(axis=1))
-
-
-def nonnegative(H: Array, g: Array) -> Array:
-    """The minimum of x'Hx / 2 - g'x with x >= 0."""
-    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
-    root = np.sqrt(np.maximum(values, 1e-9))
-    target = (vectors.T @ (g / scale)) / root
-    least, _ = optimize.nnls(root[:, None] * vectors.T, target)
-    return np.asarray(least / scale)

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from consistency.referee.document.blocks import Document
+from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.model_text import correction, data
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
 from consistency.referee.fit_covariance.page import noise_page
-from consistency.referee.show import as_html, as_json
-from consistency.referee.system.folders import write_folder
-from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 
 
@@ -27,83 +22,11 @@ def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> lis
     return write_fit(folder, ("noise", model.name), snippets(model), noise_page(model), motions, overwrite)
 
 
-def write_fit(
-    folder: Path,
-    kind_and_source: tuple[str, str],
-    texts: dict[str, str],
-    page: Document,
-    data: Callable[[Path], Sequence[str]],
-    overwrite: bool = False,
-) -> list[Path]:
-    """Write what a fit leaves, as a folder that appears whole or not at all; its files.
-
-    Pictures need ``[plot]``; without it the page has none.
-
-    Parameters
-    ----------
-    texts : files by name, the model first
-    page : what is shown, and as data
-    data : writes files of data into a folder, and returns their names
-
-    Raises
-    ------
-    InputError
-        The folder exists or cannot be written.
-    """
-    kind, source = kind_and_source
-    texts = texts | {"verdict.json": as_json.render(page) + "\n", "report.html": as_html.render(page)}
-    names: list[str] = []
-
-    def contents(at: Path) -> None:
-        names.extend(data(at))
-        for name, text in texts.items():
-            (at / name).write_text(text, encoding="utf-8")
-
-    write_folder(folder, manifest_of(kind=kind, source=source), contents, overwrite)
-    first, *rest = texts
-    return [folder / name for name in (first, *names, *rest)]
-
-
 PLACES = {3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}  # of the axes in messages of ROS: x, y, z, roll, pitch, yaw
-
-
-def toml(model: NoiseModel) -> str:
-    """noise.toml: the model, its span, and the figures of the verdict."""
-    known = data(model)
-    del known["referee"]
-    spans = known.pop("spans")
-    tables = {key: known.pop(key) for key in ("mean", "noise", "counts")}
-    lines = [
-        "# Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'",
-        "# + diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A",
-        "# carries a step's error to the end of the motion. Shown for motions over the span, and for no others.",
-        *pairs(known),
-    ]
-    for key, values in tables.items():
-        lines += ["", f"[{key}]", *pairs(values)]
-    for span in spans:
-        lines += ["", "[[spans]]", *pairs(span)]
-    return "\n".join(lines) + "\n"
-
-
-def pairs(values: dict[str, Any]) -> list[str]:
-    """Lines ``key = value``; what is not known is left out."""
-    return [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None]
-
-
-def _toml(value: Any) -> str:
-    if value is None:
-        return "nan"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-        return f'"{escaped}"'
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, dict):
-        return f"{{ {', '.join(pairs(value))} }}"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value)
+HEAD = """\
+Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'
++ diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A
+carries a step's error to the end of the motion. Shown for motions over the span, and for no others."""
 
 
 def robot_localization(model: NoiseModel) -> str:
@@ -218,7 +141,7 @@ def _numbers(values: Array) -> str:
 def snippets(model: NoiseModel) -> dict[str, str]:
     """Files of the model for other programs, by name."""
     return {
-        "noise.toml": toml(model),
+        "noise.toml": toml(HEAD, data(model)),
         "robot_localization_noise.py": robot_localization(model),
         "gtsam_noise.py": gtsam(model),
         "ceres_noise.h": ceres(model),

@@ -45,7 +45,7 @@ def compose_files(
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))
-    read = tuple(Text(note[:1].upper() + note[1:] + "." * (note[-1] not in ".?")) for note in notes)
+    read = tuple(Text(_begun(note)) for note in notes)
     chapters += [
         Chapter("verdicts", "Verdict in figures", "Figures", blocks),
         Chapter("provenance", "What was read", "Files", (*read, Facts(facts(dict(manifest))))),
@@ -58,8 +58,15 @@ def answer(judged: Mapping[str, Verdict]) -> str:
     return " ".join(f"{name} is {_ended(verdict.reasons[0])}" for name, verdict in judged.items())
 
 
+def _begun(note: str) -> str:
+    """A note as a sentence; a path at its beginning stays as it is."""
+    if "/" in note.split(maxsplit=1)[0]:
+        return _ended(note)
+    return _ended(note[:1].upper() + note[1:])
+
+
 def _ended(sentence: str) -> str:
-    return sentence if sentence.endswith(".") else f"{sentence}."
+    return sentence if sentence.endswith((".", "?")) else f"{sentence}."
 
 
 def _study(judged: tuple[Verdict, ...], title: str) -> Judged:

@@ -152,8 +152,9 @@ def _required(plan: Plan, r: Reading) -> Reading:
 
 def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> None:
     """Refuse one file for all runs, a placeholder without its option, and a truth that is not where it should be."""
-    if not plan.inputs and any("{input}" in word for word in program.words):
-        raise InputError("{input} in the command needs --each 'FILES'")
+    for part in ("{input}", "{name}"):
+        if not plan.inputs and any(part in word for word in program.words):
+            raise InputError(f"{part} in the command needs --each 'FILES'")
     here = {"here": str(program.here)}
     if Path(filled(estimates, here)).is_absolute() and not any(part in estimates for part in OF_A_RUN):
         raise InputError(f"--estimates {estimates}: is one file for all runs; let the program write into {{out}}")

@@ -22,6 +22,7 @@ CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
 ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
 RATE = 1e-4  # probability that an offset is named where there is none
+SHOWN = 5e-4  # probability that a right filter's estimates show an offset of the sign that is looked for
 LEAST = 0.01  # share of the NEES that it makes, at least
 
 
@@ -60,7 +61,7 @@ def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) ->
         return wanted, [f"{name}: {wanted:g} s are added to the timestamps of the estimates"] if wanted else []
     found = offset_of(runs)
     if wanted is None:
-        if found is None or not found.found:
+        if found is None or not found.found or not shows_in_estimates(runs, found.value):
             return 0.0, []
         share = f"{100.0 * found.explained:.0f} % of the NEES; if so, add --time-offset {found.value:.4g}"
         return 0.0, [f"{name}: the clocks of estimates and truth seem to differ by {found}, which makes {share}"]
@@ -111,6 +112,25 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
 
 
+def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:
+    """Whether the motion of the estimates, in place of that of the truth, tells of an offset of the same sign.
+
+    A right filter's error is correlated with the true motion, which may look like an offset, and with no earlier
+    estimate. Errors of odometry and of single fixes are correlated with estimates and not with the true motion. Only an
+    offset shows in both.
+
+    The motion between the two rows before is the instrumental variable of a linear regression. Its standard error is
+    found by leaving out each run in turn, or each part of a single one (jackknife); Student's t.
+    """
+    parts = 1 if len(runs) > 1 else PARTS
+    sums = np.concatenate([_estimate_sums(poses.sound(), parts) for poses in runs])
+    with np.errstate(divide="ignore", invalid="ignore"):  # where nothing moves, or in one run alone
+        top, bottom = sums.sum(axis=0)
+        without_one = (sums[:, 0] - top) / (bottom - sums[:, 1])
+        error = np.sqrt((len(sums) - 1) * without_one.var())
+        return bool(np.sign(-value) * top / bottom > distributions.t.ppf(1.0 - SHOWN, len(sums) - 1) * error)
+
+
 def _size(poses: Poses, shift: float, judged: Array) -> float:
     """Mean NEES of ``judged`` over its degrees of freedom, capped, as it is where there is no truth then."""
     if not judged.any():
@@ -122,10 +142,28 @@ def _size(poses: Poses, shift: float, judged: Array) -> float:
 
 def steps_of(poses: Poses, shift: float, parts: int) -> Array:
     """Gauss-Newton step from ``shift`` in each part, s; NaN where nothing moves."""
-    e = whiten(poses.errors(shift), poses.covariance)
+    e, v = _errors_and_motion(poses, shift)
+    sums = _sums_of_parts(v, e, v, parts)
+    return np.array([-top / bottom if bottom > 0 else np.nan for top, bottom in sums])
+
+
+def _estimate_sums(poses: Poses, parts: int) -> Array:
+    """Sums as in :func:`_sums_of_parts`, along the motion of the estimates between the two rows before."""
+    e, v = _errors_and_motion(poses, 0.0)
+    before = np.full_like(e, np.nan)
+    before[2:] = poses.error_of(np.arange(len(e) - 2), poses.estimate[1:-1])
+    return _sums_of_parts(whiten(before, poses.covariance), e, v, parts)
+
+
+def _errors_and_motion(poses: Poses, shift: float) -> tuple[Array, Array]:
+    """Errors at ``shift`` and their derivative by it, both whitened, (N, n)."""
     moved = (poses.errors(shift + STEP) - poses.errors(shift - STEP)) / (2.0 * STEP)
-    v = whiten(moved, poses.covariance)
-    top, bottom = (v * e).sum(axis=1), np.square(v).sum(axis=1)
-    fine = np.isfinite(top) & np.isfinite(bottom) & (np.square(e).mean(axis=1) < CAP)
+    return whiten(poses.errors(shift), poses.covariance), whiten(moved, poses.covariance)
+
+
+def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
+    """Sums of the products of ``along`` with errors ``e`` and with their motion ``v``, each (N, n), (parts, 2)."""
+    products = np.column_stack([(along * e).sum(axis=1), (along * v).sum(axis=1)])
+    fine = np.isfinite(products).all(axis=1) & (np.square(e).mean(axis=1) < CAP)
     groups = np.array_split(np.flatnonzero(fine), parts)
-    return np.array([-top[g].sum() / bottom[g].sum() if bottom[g].sum() > 0 else np.nan for g in groups])
+    return np.array([products[rows].sum(axis=0) for rows in groups])

@@ -169,7 +169,11 @@ def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool
 
 def longest_start(tracks: Sequence[Track]) -> int:
     """Rows that a start known exactly may take, in which a covariance is singular; 0 where a run begins otherwise."""
-    starts = [(_first_full(track), len(track.column)) for track in tracks]
+    starts = []
+    for track in tracks:
+        starts.append((_first_full(track), len(track.column)))
+        if starts[-1][0] == 0 and len(track.column):
+            return 0
     ended = [start for start, rows in starts if start < rows]
     if not ended:
         return max((rows for _, rows in starts), default=0)

@@ -52,7 +52,7 @@ def render(document: Document, pictures: Pictures | None = None) -> str:
     if any(chapter.switches for chapter in document.chapters):
         script = f"<script>{SCRIPT}</script>"
         policy = f"'sha256-{b64encode(sha256(SCRIPT.encode()).digest()).decode()}'"
-    return f"""<!DOCTYPE html>
+    whole = f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -76,6 +76,7 @@ style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'">
 </body>
 </html>
 """
+    return whole.replace(" %", "&nbsp;%")  # no line begins with it
 
 
 def fragment(*blocks: Block) -> str:
@@ -122,7 +123,7 @@ class Page:
             case Bullets():
                 return _list(block.texts)
             case Settings():
-                return f"<pre>{escape(block.text)}</pre>"
+                return f'<pre tabindex="0">{escape(block.text)}</pre>'
             case Table():
                 return _table(block)
             case Details():
@@ -135,7 +136,9 @@ class Page:
         if not drawings:
             return ""
         title, caption = escape(figure.title), escape(figure.caption)
-        charts = "\n".join(f'<div class="chart" role="img" aria-label="{title}">{svg}</div>' for svg in drawings)
+        charts = "\n".join(
+            f'<div class="chart" role="img" tabindex="0" aria-label="{title}">{svg}</div>' for svg in drawings
+        )
         return (
             f"<figure>\n<h{figure.level}>{title}</h{figure.level}>\n{charts}\n"
             f"<figcaption>{caption}</figcaption>\n</figure>"

@@ -242,7 +242,9 @@ def add_legend(figure: Figure, beside: bool = False) -> Figure:
     if not beside:
         longest = max(len(line) for label in labels for line in label.split("\n"))
         columns = max(1, min(len(labels), int(17.5 * figure.get_figwidth() / (longest + 7))))
-        lines = -(-len(labels) // columns) * max(label.count("\n") + 1 for label in labels)
+        rows = -(-len(labels) // columns)
+        columns = -(-len(labels) // rows)  # Matplotlib fills columns; the last row is nearly as long as the others
+        lines = rows * max(label.count("\n") + 1 for label in labels)
         figure.set_figheight(figure.get_figheight() + 0.13 * lines)
         options = {"loc": "outside upper left", "ncols": columns, "alignment": "left"}
     _write_labels(figure.legend(*_entries(found), **options), found, labels)

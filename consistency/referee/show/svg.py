@@ -68,6 +68,8 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
         engine: Any = figure.get_layout_engine()
         engine.execute(figure)
         figure.set_layout_engine("none")
+    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
+        patch.set_visible(False)  # the ground is that of the page
     kind = "narrow" if figure.get_figwidth() < WIDTH else "full"
     return _compact(saved(figure, "svg", name=name).decode("utf-8"), kind, titles or Titles())
 

@@ -176,6 +176,7 @@ class Same(Mine):
     [
         ({"filters": ["ekf-xyz", "ekf-xyz"]}, "a filter is given twice: ekf-xyz"),
         ({"filters": ["ekf-xyz", Same()]}, "given twice: ekf-xyz"),
+        ({"filters": [Same()]}, "filter 'ekf-xyz': is a built-in filter; give yours another name"),
         ({"filters": ["ekf-uvd"]}, r"filter 'ekf-uvd' works on a sensor uvd, not 'xyz'.*fit: .*ekf-xyz"),
         ({"filters": ["ekf-xyzz"]}, r"unknown filter 'ekf-xyzz' \(did you mean 'ekf-xyz'\?\); known: kf, "),
         ({"filters": []}, "no filter given; known: kf"),

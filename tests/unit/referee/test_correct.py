@@ -11,10 +11,10 @@ from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.correct import correct, fit_groups, held_out_by, with_uncertainty
+from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, held_out_by, with_uncertainty
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
-from consistency.referee.fit_covariance.floors import fit_runs, floor_interval, likeness, scores
-from consistency.referee.fit_covariance.white_noise import interval_of_ratio
+from consistency.referee.fit_covariance.floors import fit_runs, likeness, relative_sizes, scores
+from consistency.referee.fit_covariance.intervals import chance_of_one, floor_interval, interval_of_ratio
 from consistency.referee.types import Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -327,11 +327,63 @@ def test_gradients_and_information_are_those_of_the_likelihood(rng):
     assert (np.linalg.eigvalsh(information) > 0).all()
 
 
-def test_the_interval_of_a_factor_is_that_of_the_jackknife():
+def test_sizes_by_other_factors_are_those_of_the_covariances(rng):
+    """In the mean over steps, by the trace of the inverse of one times the other."""
+    record = wrong(rng, runs=2, steps=5)
+    blocks = blocks_of(POSE, 6, False)
+    whole = Factors(blocks, np.array([4.0, 0.7]), np.array([0.8, 0.3]))
+    other = Factors(blocks, np.array([3.0, 0.9]), np.array([0.5, 0.6]))
+    expected = np.zeros(2)
+    for b, block in enumerate(blocks):
+        ratios = np.linalg.inv(block.of(whole.applied(record.covariance))) @ block.of(other.applied(record.covariance))
+        expected[b] = np.trace(ratios, axis1=-2, axis2=-1).mean() / 3
+    assert relative_sizes(record, whole, [other])[0] == pytest.approx(expected)
+
+
+def test_the_ends_of_the_interval_of_a_factor():
+    """By the variance of its logarithm over runs: the lower one by Student's t, the upper one by chi-square."""
     left_out = np.array([8.0, 9.0, 9.5, 10.0])
-    error = np.sqrt(3 / 4 * np.square(np.log(left_out) - np.log(left_out).mean()).sum())
-    reach = np.exp(stats.t.ppf(0.975, 3) * error)
-    assert tuple(interval_of_ratio(9.0, left_out)) == pytest.approx((9.0, 9.0 / reach, 9.0 * reach))
+    variance = 3 / 4 * np.square(np.log(left_out) - np.log(left_out).mean()).sum()
+    reach, nu = stats.t.ppf(0.975, 3), 2.0 / variance
+    high = 9.0 * nu / stats.chi2.ppf(stats.norm.sf(reach), nu)
+    assert tuple(interval_of_ratio(9.0, left_out)) == pytest.approx((9.0, 9.0 * np.exp(-reach * variance**0.5), high))
+
+
+def test_the_chance_of_1_is_5_percent_at_the_end_of_an_interval():
+    spread = np.array([0.9, 1.1, 0.95, 1.05, 1.02])
+    for end in tuple(interval_of_ratio(1.0, spread))[1:]:
+        assert chance_of_one(1.0 / end, spread / end) == pytest.approx(0.05)
+    assert chance_of_one(1.0, spread) > 0.9
+
+
+def test_factors_are_needed_all_together(rng):
+    """One of two at a chance of 3 % is no more than chance has, where two are asked."""
+    fit = fit_alone(wrong(rng), blocks_of(POSE, 6, False))
+    assert are_needed([replace(fit, chance=(0.03,))])
+    assert not are_needed([replace(fit, chance=(0.03, 0.5))])
+    assert not are_needed([replace(fit, chance=(0.03,)), replace(fit, chance=(0.5,))])
+    floors = replace(fit.factors, floor=np.array([0.0, 0.1]))
+    assert are_needed([replace(fit, chance=(0.5, 0.5), factors=floors)])
+
+
+def test_the_first_line_says_that_no_factor_is_needed():
+    """One of five tries with a right covariance at least, each 90 %: fails by chance in fewer than 1 in 50,000."""
+    rng = np.random.default_rng()
+    words = "no factor is shown to be needed, at 95% for all of them together"
+    right = (covariances(rng, 12, 10, 6) for _ in range(5))
+    assert any(words in repr(correct(record_of(drawn(rng, P), P))) for P in right)
+    assert words not in repr(correct(wrong(rng)))
+
+
+def test_no_factor_is_invented_where_the_covariance_is_right():
+    """Two blocks at 5 % together in 200 draws of 6 runs, measured 5.9 %: fails by chance in fewer than 1 in 1e5."""
+    rng = np.random.default_rng()
+    invented = 0
+    for _ in range(200):
+        P = covariances(rng, 6, 10, 6)
+        invented += are_needed([fit_alone(record_of(drawn(rng, P), P), blocks_of(POSE, 6, False))])
+    assert invented < 32
+    assert are_needed([fit_alone(wrong(rng), blocks_of(POSE, 6, False))])
 
 
 def test_a_floor_at_zero_has_a_one_sided_interval():
@@ -341,6 +393,8 @@ def test_a_floor_at_zero_has_a_one_sided_interval():
     assert tuple(found) == pytest.approx((0.0, 0.0, stats.t.isf(0.05, 4) * error))
     inside = floor_interval(0.1, 0.1, left_out)
     assert inside.high == pytest.approx(0.1 + stats.t.isf(0.025, 4) * error)
+    away = np.array([0.9, 1.1, 0.95, 1.05])
+    assert floor_interval(1.0, 1.0, away) == interval_of_ratio(1.0, away)
 
 
 def test_groups_have_factors_of_their_own_runs(rng):

@@ -2,6 +2,8 @@
 
 import json
 import re
+import runpy
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -382,3 +384,47 @@ def test_a_folder_is_read_in_python_as_by_the_command(tmp_path):
     assert [block.name for block in found.blocks] == ["position", "attitude"]
     values = found.fit.factors.factor
     assert values == pytest.approx([9.0, 1.0], rel=0.3)
+
+
+# --- examples with public data ----------------------------------------------------------------------------------------
+
+
+def example(name):
+    return runpy.run_path(str(Path(__file__).parents[3] / "docs/examples" / name))
+
+
+def test_positions_by_satellite_are_those_that_the_ranges_have(rng, tmp_path):
+    """Exact ranges to satellites give the place and the clock's error, and a covariance in east, north and up."""
+    script = example("satellite_positions.py")
+    place = np.array([3785108.0, 899901.0, 5037234.0])
+    up = place / np.linalg.norm(place)
+    away = rng.normal(size=(7, 3)) + 2.0 * up
+    satellites = place + 2e7 * away / np.linalg.norm(away, axis=1)[:, None]
+    turned = script["TURN"] * (satellites[:, 0] * place[1] - satellites[:, 1] * place[0])
+    ranges = np.linalg.norm(satellites - place, axis=1) + turned + 30.0
+    x, C = script["position_of"](np.column_stack([ranges, np.full(7, 4.0), satellites]), place + 100.0)
+    assert x == pytest.approx([*place, 30.0], abs=1e-4)
+    assert (np.linalg.eigvalsh(C) > 0).all()
+    lines = [f"pseudorange3 0 {r} 4 {s[0]} {s[1]} {s[2]}" for r, s in zip(ranges, satellites, strict=True)]
+    (tmp_path / "Berlin_Potsdamer_Platz_Input.txt").write_text("\n".join(lines))
+    (tmp_path / "Berlin_Potsdamer_Platz_GT.txt").write_text(f"point3 0 {place[0]} {place[1]} {place[2]}")
+    assert script["rows_of"](tmp_path / "Berlin_Potsdamer_Platz_Input.txt", "pseudorange3").shape == (7, 6)
+    east, north, vertical = script["local_axes"](place)
+    assert vertical @ up > 0.999
+    assert np.cross(east, north) == pytest.approx(vertical)
+
+
+def test_a_filter_between_beacons_is_told_where_it_is():
+    script = example("radio_beacons.py")
+    x, P = np.array([0.3, -0.2, 0.0]), np.eye(3)
+    for beacon in ([5.0, 0.0], [0.0, 5.0], [-5.0, 0.0], [0.0, -5.0]) * 5:
+        x, P = script["update"](x, P, 5.0, 1e-4, np.array(beacon))
+    assert x[:2] == pytest.approx([0.0, 0.0], abs=0.01)
+    x, P = script["predict"](x, P, [1.0, 1.0, 0.0, 0.1, 0.01, 0.01], 2.0)
+    assert x == pytest.approx([2.0, 0.0, 0.0], abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["satellite_positions.py", "radio_beacons.py"])
+def test_a_folder_without_the_data_is_named(name, tmp_path):
+    with pytest.raises(SystemExit, match="no such file; DIR must be the folder datasets/"):
+        example(name)["main"](tmp_path)

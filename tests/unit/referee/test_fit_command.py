@@ -25,8 +25,8 @@ from consistency.referee.fit_covariance.writing import (
     gtsam,
     robot_localization,
     seconds,
+    snippets,
     straight,
-    toml,
     write_model,
 )
 from consistency.referee.geometry.groups import composed, vectors
@@ -208,7 +208,7 @@ def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng, tmp_path)
 def test_noise_toml_has_all_figures(planar):
     import tomllib
 
-    read = tomllib.loads(toml(planar))
+    read = tomllib.loads(snippets(planar)["noise.toml"])
     n = planar.noise
     for key, values in (("variance_per_m", n.per_m), ("variance_per_rad", n.per_rad), ("floor", n.floor)):
         assert read["noise"][key] == values.tolist()

@@ -17,6 +17,7 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
+from consistency.referee.fit_covariance.intervals import interval_of
 from consistency.referee.fit_covariance.model_text import noise_lines, sentence
 from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of
 from consistency.referee.fit_covariance.noise_model import caution
@@ -34,7 +35,6 @@ from consistency.referee.fit_covariance.systematic_errors import (
 from consistency.referee.fit_covariance.white_noise import (
     fit_noise,
     fit_terms,
-    interval_of,
     jitter_of,
     nees_of,
     terms_of,

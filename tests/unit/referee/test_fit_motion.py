@@ -34,7 +34,7 @@ from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.refusals import require_poses
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.white_noise import fit_noise
-from consistency.referee.fit_covariance.writing import toml
+from consistency.referee.fit_covariance.writing import snippets
 from consistency.referee.geometry.groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
@@ -135,7 +135,7 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng):
     assert not after.by_motion.is_found
     assert after.noise.mean.slip == pytest.approx(-0.2, abs=0.05)
     assert f"correct first: {after.noise.mean.slip:+.3g} m of way a rad of turn" in correction(after)
-    assert f"slip_m_per_rad = {after.noise.mean.slip!r}" in toml(after)
+    assert f"slip_m_per_rad = {after.noise.mean.slip!r}" in snippets(after)["noise.toml"]
     assert after.noise.per_rad[0] < before.noise.per_rad[0] or after.noise.per_m[0] < before.noise.per_m[0]
     already = replace(before, noise=replace(before.noise, mean=after.noise.mean))
     assert "--by-turn" not in sentence(already)

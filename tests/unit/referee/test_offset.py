@@ -1,6 +1,7 @@
 """Clocks that differ, on runs whose offset is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
-from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, steps_of
+from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, shows_in_estimates, steps_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 
@@ -36,6 +37,40 @@ def run_of(rng, offset, noise=1.0, speed=5.0):
     )  # fmt: skip
     estimate = poses.known(offset).truth - noise * SIGMA * rng.normal(size=(100, 3))
     return replace(poses, estimate=estimate)
+
+
+def kalman_runs(rng, count, offset=0.0):
+    """Right filters of position and velocity that measure the position each second, whose clocks are ``offset`` early.
+
+    White acceleration of 1 m^2/s^3 as in docs/examples/cpp; 100 estimates in 10 s, the truth at every 0.01 s.
+    """
+
+    def moved(x, seconds):
+        noise = np.linalg.cholesky([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
+        return x @ np.array([[1.0, seconds], [0.0, 1.0]]).T + rng.normal(size=x.shape) @ noise.T
+
+    truth = [rng.normal(size=(count, 2))]
+    for _ in range(1100):
+        truth.append(moved(truth[-1], 0.01))
+    F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.1**3 / 3, 0.1**2 / 2], [0.1**2 / 2, 0.1]])
+    x, P, estimates, covariances = np.zeros((count, 2)), np.eye(2), [], []
+    for step in range(1, 101):
+        x, P = x @ F.T, F @ P @ F.T + Q
+        if step % 10 == 0:
+            gain = P[:, 0] / (P[0, 0] + 0.09)
+            measured = truth[10 * step][:, 0] + 0.3 * rng.normal(size=count)
+            x, P = x + np.outer(measured - x[:, 0], gain), P - np.outer(gain, P[0])
+        estimates.append(x)
+        covariances.append(P)
+    t, place = 0.1 * np.arange(1, 101), Places("line {}".format, np.arange(100))
+    poses = Poses(
+        place, t - offset, t, np.array(covariances), np.ones(100, bool), 0.01 * np.arange(1101), t, "vector", "vector",
+        0.01,
+    )  # fmt: skip
+    return [
+        replace(poses, estimate=estimate, truth=path)
+        for estimate, path in zip(np.swapaxes(estimates, 0, 1), np.swapaxes(truth, 0, 1), strict=True)
+    ]
 
 
 @pytest.fixture
@@ -126,6 +161,55 @@ def test_with_noise_it_is_named(rng):
 def test_a_right_clock_is_left_alone(rng):
     """Each is named with probability 1e-4: more than 1 of 20 with 2e-6."""
     assert sum(bool(clock_shift("est", [run_of(rng, 0.0) for _ in range(8)], None)[1]) for _ in range(20)) <= 1
+
+
+def test_a_right_filters_errors_that_go_with_the_true_velocity_are_not_laid_on_the_clock(rng):
+    """The motion of the truth names an offset in more than 9 of 10; each is told with probability 1e-3.
+
+    Of three none is found with 1e-6, and more than one told with 3e-6.
+    """
+    logs = [kalman_runs(rng, 60) for _ in range(3)]
+    assert any(offset_of(runs).found for runs in logs)
+    assert sum(bool(clock_shift("est", runs, None)[1]) for runs in logs) <= 1
+
+
+@pytest.mark.parametrize("offset", [-0.2, 0.2])
+def test_clocks_of_a_right_filter_that_differ_are_named(rng, offset):
+    """40 runs find it to 0.006 s: 0.05 is eight times that."""
+    runs = kalman_runs(rng, 40, offset)
+    assert "seem to differ by" in clock_shift("est", runs, None)[1][0]
+    assert offset_of(runs).value == pytest.approx(offset, abs=0.05)
+
+
+def test_estimates_show_an_offset_of_its_own_sign(rng):
+    runs = [run_of(rng, 0.04, noise=1e-3) for _ in range(4)]
+    assert shows_in_estimates(runs, 0.04)
+    assert not shows_in_estimates(runs, -0.04)
+    assert shows_in_estimates([run_of(rng, -0.04, noise=1e-3)], -0.04)
+    still = [replace(run, estimate=np.zeros_like(run.estimate)) for run in runs]
+    assert not shows_in_estimates(still, 0.04)
+
+
+def test_the_error_of_a_row_is_not_in_the_motion_that_it_is_compared_with(rng, monkeypatch):
+    """Errors of single fixes go with the motion of the estimates to their own row, by 40 standard errors."""
+    monkeypatch.setattr(clock_offset, "SHOWN", 1e-7)
+    runs = [run_of(rng, 0.0) for _ in range(30)]
+    assert not shows_in_estimates(runs, 0.01)
+    assert not shows_in_estimates(runs, -0.01)
+
+
+def test_what_estimates_show_by_hand(rng, monkeypatch):
+    """Sums 3, 5 and 4, each with 10: an offset of -0.4 s; without one of them -0.45, -0.35 and -0.4.
+
+    The standard error is then the root of 2 / 3 * (0.05^2 + 0.05^2), 1 / (10 sqrt 3).
+    That is t = -6.93, with the probability 0.0101 with 2 degrees of freedom.
+    """
+    monkeypatch.setattr(clock_offset, "_estimate_sums", lambda poses, parts: np.array([[poses, 10.0]]))
+    runs = [SimpleNamespace(sound=lambda top=top: top) for top in (3.0, 5.0, 4.0)]
+    for rate, shown in ((0.0102, True), (0.0100, False)):
+        monkeypatch.setattr(clock_offset, "SHOWN", rate)
+        assert shows_in_estimates(runs, -0.4) is shown
+        assert not shows_in_estimates(runs, 0.4)
 
 
 def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng):

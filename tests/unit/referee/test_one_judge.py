@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.diagnostics import Design, MapRecord, Record, Rejections, Settings, Verdict, follow, judge, look
+from consistency.referee.diagnostics.judging.error_parts import _sum_of_correlations
 from consistency.referee.diagnostics.maps.map_nees import last_nees
 from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.diagnostics.records.whitening import whiten, whiten_group
@@ -173,10 +174,18 @@ def test_a_group_of_components_is_whitened_by_its_own_covariance():
     assert_array_equal(whiten_group(e, P, [0, 1, 2]), whiten(e, P))
 
 
-def test_every_entry_is_asked():
-    P = np.zeros((4, 5, 3, 3))
+@pytest.mark.parametrize("n", [3, 9])
+def test_every_entry_is_asked(n):
+    P = np.zeros((4, 5, n, n))
     P[1, 2, 0, 2] = P[3, 4, 1, 1] = np.nan
     assert np.argwhere(~every_entry(np.isfinite, P)).tolist() == [[1, 2], [3, 4]]
+
+
+def test_correlations_are_added_up():
+    rng = np.random.default_rng(3)
+    A = rng.standard_normal((5, 4, 6))
+    expected = sum(np.corrcoef(rows) for rows in A)
+    assert_allclose(_sum_of_correlations(np.array([np.cov(rows) for rows in A])), expected)
 
 
 def test_a_failed_run_is_no_verdict_of_the_rest():

@@ -146,9 +146,10 @@ def test_options_that_do_not_go_together(options, message, place, capsys):
     assert not (place / "out").exists()
 
 
-def test_a_recorded_file_needs_its_option(place, capsys):
-    status, _, err = monte_carlo("--out", "out", "--", "./filter", "{input}", capsys=capsys)
-    assert (status, "{input} in the command needs --each" in err) == (2, True)
+@pytest.mark.parametrize("part", ["{input}", "{name}"])
+def test_a_recorded_file_needs_its_option(part, place, capsys):
+    status, _, err = monte_carlo("--out", "out", "--", "./filter", f"--log={part}.csv", capsys=capsys)
+    assert (status, f"{part} in the command needs --each" in err) == (2, True)
     (place / "out").mkdir()  # an empty folder is taken
     with pytest.raises(SystemExit):
         main(["monte-carlo", "--out", "out", "--", "./filter", "{run}"])

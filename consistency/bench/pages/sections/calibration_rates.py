@@ -23,7 +23,7 @@ COLUMNS = (
     Column("Promised", number=True),
     Column("Gates", number=True),
     Column("Measured", number=True),
-    Column("Worst world", width="1fr", number=True),
+    Column("Worst world", width="1fr"),
     Column("99 % interval there", "99 % interval\nthere", number=True),
 )
 
@@ -122,7 +122,7 @@ def calibration_rates() -> tuple[Block, ...]:
         return ()
     promises = Table(COLUMNS, groups(c), "Promises of the referee, and how often they were kept", style="grouped")
     worlds = Facts(tuple((name, about.replace("`", "")) for name, about in c.worlds.items()), HEADS, "4cm")
-    return Text(text(c)), promises, Details("Worlds", (worlds,))
+    return Text(text(c)), Details("Measured rates", (promises,)), Details("Worlds", (worlds,))
 
 
 def groups(c: Calibration) -> tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]:

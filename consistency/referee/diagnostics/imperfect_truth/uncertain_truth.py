@@ -126,8 +126,9 @@ class UncertainTruth:
 
     @cached_property
     def by_group(self) -> Mapping[str, Array]:
-        """:meth:`eigenvalues` of each group."""
-        return {key: self.eigenvalues(index) for key, index in self.groups.items()}
+        """:meth:`eigenvalues` of each group, and of velocity."""
+        groups = {**self.groups, **self.total.reported}
+        return {key: self.eigenvalues(index) for key, index in groups.items()}
 
     def share(self, group: str = MAIN) -> float:
         """s of a group: the part of P_t in both covariances; NaN where nothing is judged."""
@@ -173,7 +174,7 @@ class UncertainTruth:
     @cached_property
     def tails(self) -> Mapping[str, tuple[float, float]]:
         """Of all components and each group: p values of a covariance that is too small, and of one too large."""
-        return {key: (self.above(key), self.below(key)) for key in self.by_group}
+        return {key: (self.above(key), self.below(key)) for key in self.groups}
 
     def above(self, group: str = MAIN, ratio: float = 1.0) -> float:
         """p value of the covariance of e being at most ``ratio`` P, under any dependence of the errors of the truth."""
@@ -246,7 +247,7 @@ class UncertainTruth:
 
     def truth_share(self) -> TruthShare:
         """Share of the truth's own covariance in that of the errors."""
-        axes = {key: self.share(key) for key in self.by_group if key != MAIN}
+        axes = {key: self.share(key) for key in self.groups if key != MAIN}
         return TruthShare(self.share(), axes, self.record.truth_errors, self.record.truth_shared)
 
     def of_estimate(self, parts: ErrorParts, answers: Sequence[Answer], settings: Settings) -> ErrorParts:

@@ -15,6 +15,7 @@ from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
 from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.records.groups import spans_of
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
@@ -28,6 +29,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     DIRECTION,
     GROUP,
     MAIN,
+    SCALE,
     SHAPE,
     SHARES,
     STEP,
@@ -54,6 +56,7 @@ from consistency.referee.diagnostics.verdict.parts import (
 from consistency.referee.types import Array, Indices
 
 SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at which a correlation has a sign
+NAMING = 0.5  # of the false-alarm rate: that a pair of axes is named where the factors of the axes alone are wrong
 VISIBLE = 0.05  # a stated correlation that is worth a word
 TINIEST = 1e-300
 
@@ -159,15 +162,16 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 
 
 def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
-    """Inflation of each component and group, since the fault began."""
+    """Inflation of each component and group, and of velocity, since the fault began."""
     late = from_step(location.since)
     confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
+    reported = sample.reported
     inflation = {}
-    for key, index in sample.components.items():
+    for key, index in reported.items():
         inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
     if tests.largest is None:
-        return ComponentRatios(sample.names, sample.components, inflation)
-    return ComponentRatios(sample.names, sample.components, inflation, tests.largest.ratio, tests.largest.direction)
+        return ComponentRatios(sample.names, reported, inflation)
+    return ComponentRatios(sample.names, reported, inflation, tests.largest.ratio, tests.largest.direction)
 
 
 def by_group_of(
@@ -240,19 +244,60 @@ def bias_of(sample: Sample, step: int | None, location: Location, faults: set[st
 
 
 def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
-    """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found."""
+    """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found.
+
+    A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others; ``alone``, on
+    which the status depends, is of the pair farthest off in any case.
+    """
     if tests.matrix is None or sample.dof == 1:
         return None
     here = slice(None)
     if tests.shape_step is not None and "shape" not in faults:
         here = slice(tests.shape_step - 1, tests.shape_step)
     counted = sample.counted[:, here]
-    pair, actual, stated = _correlation(sample.error[:, here], sample.covariance[:, here], counted)
-    known = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
-    opposite = actual * stated < 0.0 and abs(actual) > known and abs(stated) > VISIBLE
-    wrong_sign = bool(faults & set(SHAPE)) and opposite
+    if not counted.any():
+        return Shape(tests.matrix, tests.shape_step, None, float("nan"), float("nan"))
+    gap, stated = _correlations(sample.error[:, here], sample.covariance[:, here], counted)
+    shown = np.zeros(gap.shape, bool)
+    if faults & {*SCALE, *SHAPE}:
+        shown = _shown_pairs(sample, here, NAMING * false_alarm)
+    clear = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
+    actual = stated + gap
+    opposite = (actual * stated < 0.0) & (np.abs(actual) > clear) & (np.abs(stated) > VISIBLE)
+    opposite &= bool(faults & set(SHAPE))
+    farthest = pair = _largest(gap)
+    if shown.any():
+        pair = _largest(np.where(shown, gap, 0.0))
     right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in sample.names)
-    return Shape(tests.matrix, tests.shape_step, pair, actual, stated, wrong_sign, wrong_sign and right)
+    return Shape(
+        matrix=tests.matrix,
+        step=tests.shape_step,
+        pair=pair,
+        actual=float(actual[pair]),
+        stated=float(stated[pair]),
+        wrong_sign=bool(opposite[pair]),
+        alone=bool(opposite[farthest]) and right,
+        shown=bool(shown[pair]),
+    )
+
+
+def _shown_pairs(sample: Sample, here: slice, false_alarm: float) -> Array:
+    """Pairs of axes whose correlation is shown to be wrong, (n, n) of bool.
+
+    Over whole runs, and in the step ``here`` where the shape was found at fault: each at half the rate then, and the
+    step corrected for the number of steps from which it was chosen. Where the axes alone are wrong, each by a factor
+    of its own, a pair is shown with probability ``false_alarm`` at most (Bonferroni over the pairs).
+    """
+    counted = sample.counted
+    pairs = sample.dof * (sample.dof - 1) // 2
+    found = [(slice(None), pairs)]
+    if here != slice(None):
+        found = [(slice(None), 2 * pairs), (here, 2 * pairs * int(counted.any(axis=0).sum()))]
+    shown = np.zeros((sample.dof, sample.dof), bool)
+    for steps, looks in found:
+        p_values = pair_p_values(sample.error[:, steps], sample.covariance[:, steps], counted[:, steps])
+        shown |= p_values * looks <= false_alarm
+    return shown
 
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
@@ -299,10 +344,14 @@ def _mean_of_known(values: Array) -> float:
     return float(np.nanmean(values))
 
 
-def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple[int, int] | None, float, float]:
-    """The two axes whose errors are correlated least as stated, with both correlations, averaged over steps."""
-    if not counted.any():
-        return None, float("nan"), float("nan")
+def _largest(matrix: Array) -> tuple[int, int]:
+    """Place of the largest absolute entry of a symmetric matrix, above the diagonal."""
+    i, j = np.unravel_index(np.abs(matrix).argmax(), matrix.shape)
+    return min(int(i), int(j)), max(int(i), int(j))
+
+
+def _correlations(error: Array, covariance: Array, counted: Array) -> tuple[Array, Array]:
+    """Correlations of the errors less those stated, and those stated, averaged over steps; (n, n) both."""
     n = error.shape[-1]
     count = int(counted.sum())
     mean = np.zeros(n)
@@ -320,16 +369,11 @@ def _correlation(error: Array, covariance: Array, counted: Array) -> tuple[tuple
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.nan_to_num(second / np.outer(scale, scale) - stated)
     np.fill_diagonal(gap, 0.0)
-    i, j = sorted(int(k) for k in np.unravel_index(np.abs(gap).argmax(), gap.shape))
-    return (i, j), float(stated[i, j] + gap[i, j]), float(stated[i, j])
+    return gap, stated
 
 
 def _sum_of_correlations(covariance: Array) -> Array:
     """Correlation matrices of covariances (N, n, n), added up."""
-    n = covariance.shape[-1]
-    total = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i, n):
-            each = covariance[:, i, j] / (np.sqrt(covariance[:, i, i]) * np.sqrt(covariance[:, j, j]))
-            total[i, j] = total[j, i] = each.sum()
-    return total
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    rows = [(covariance[:, i] / (sigma[:, i, None] * sigma)).sum(axis=0) for i in range(sigma.shape[1])]
+    return np.array(rows)

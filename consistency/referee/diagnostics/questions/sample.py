@@ -20,6 +20,7 @@ from consistency.referee.types import Array, Indices
 
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}
+VELOCITY = {"vx", "vy", "vz"}
 
 
 class Centre(NamedTuple):
@@ -70,6 +71,15 @@ class Sample:
     def covariance(self) -> Array:
         """(N, T, n, n), of a sample with errors."""
         return np.asarray(self.record.covariance, float)
+
+    @property
+    def reported(self) -> dict[str, list[int]]:
+        """The components and velocity, whose ratio is reported and not tested."""
+        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
+        components = dict(self.components)
+        if 1 < len(velocity) < len(self.names):
+            components.setdefault("velocity", velocity)
+        return components
 
     @property
     def groups(self) -> Groups | None:

@@ -9,12 +9,13 @@ from scipy import optimize, special
 
 from consistency.referee.diagnostics.questions.bias import StepMoments, step_moments, t_squared
 from consistency.referee.diagnostics.questions.scale import UNKNOWN, ratio_interval, scale_test
-from consistency.referee.diagnostics.records.large_arrays import by_runs
-from consistency.referee.diagnostics.records.whitening import all_finite
+from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
+from consistency.referee.diagnostics.records.whitening import all_finite, standardise
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array
 
+FEWEST = 6  # runs that determine the size of an axis in a step
 ALL_AT_ONCE = 3  # numbers, of which the test of Hotelling keeps its rate with heavy tails
 
 
@@ -116,6 +117,73 @@ def products_test(products: Array) -> float:
     weights = np.linalg.eigvalsh(u @ u.T if runs < size else u.T @ u)
     scores = float(np.square(special.ndtri(tail)).sum())
     return float(min(1.0, 2.0 * min(2.0 * size * float(tail.min()), weighted_chi_square_tail(scores, weights))))
+
+
+def pair_p_values(error: Array, covariance: Array, counted: Array) -> Array:
+    """p value of each pair of axes being correlated as stated, whatever the factors on the variances of the axes.
+
+    In each step the errors of an axis are taken about their mean over the runs and divided by their own standard
+    deviation, so that a factor on an axis, which may change from step to step, drops out. Two axes u, v with the stated
+    correlation r are whitened together,
+
+        p + q = (u + v) / sqrt(1 + r),    p - q = (u - v) / sqrt(1 - r),
+
+    so that p and q are not correlated if r is right. The mean of p q depends on the size of u and v in second order
+    only; over N runs that leaves -r / (2 (N - 1)), which is added. In a single step the correlation of p and q is
+    tested, with Student's t of N - 2 degrees of freedom. Over several steps a run is one observation of the mean of
+    p q: Student's t over the runs, as in :func:`products_test`.
+
+    Parameters
+    ----------
+    error, covariance : (runs, steps, n), (runs, steps, n, n)
+    counted : (runs, steps) of bool; steps with fewer than 6 runs are left out
+
+    Returns
+    -------
+    (n, n), NaN on the diagonal and where nothing can be tested
+    """
+    runs, steps, n = error.shape
+    p_values, above = np.full((n, n), np.nan), np.triu_indices(n, 1)
+    pairs = list(zip(*above, strict=True))
+    products, size = np.zeros((runs, len(pairs))), np.zeros(len(pairs))
+    count = np.zeros(runs)
+    for here in block_slices(steps, runs):
+        N = counted[:, here].sum(axis=0)
+        known = counted[:, here] & (N >= FEWEST)
+        P = covariance[:, here]
+        u = _in_own_spread(standardise(error[:, here], P), known)
+        count += known.sum(axis=1)
+        for k, (i, j) in enumerate(pairs):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                r = P[..., i, j] / np.sqrt(P[..., i, i] * P[..., j, j])
+                total = (u[..., i] + u[..., j]) / np.sqrt(1.0 + r)
+                gap = (u[..., i] - u[..., j]) / np.sqrt(1.0 - r)
+            p, q = 0.5 * (total + gap), 0.5 * (total - gap)
+            size[k] = np.sqrt(np.square(p[known]).sum() * np.square(q[known]).sum())
+            product = p * q + r / (2.0 * np.maximum(N - 1, 1))
+            products[:, k] += np.where(known, product, 0.0).sum(axis=1)
+    products, count = products[count > 0], count[count > 0]
+    N = len(products)
+    if N < FEWEST:
+        return p_values
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if steps == 1:
+            r = products.sum(axis=0) / size
+            t, freedom = r * np.sqrt((N - 2) / (1.0 - r * r)), N - 2
+        else:
+            products /= count[:, None]
+            t, freedom = products.mean(axis=0) * np.sqrt(N) / products.std(axis=0, ddof=1), N - 1
+    p_values[above] = p_values.T[above] = 2.0 * special.stdtr(freedom, -np.abs(t))
+    return p_values
+
+
+def _in_own_spread(errors: Array, known: Array) -> Array:
+    """Errors (runs, steps, n) less their mean over the ``known`` runs of each step, over their standard deviation."""
+    N = np.maximum(known.sum(axis=0), 2)[:, None]
+    e = np.where(known[..., None], errors, 0.0)
+    e = np.where(known[..., None], e - e.sum(axis=0) / N, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(e / np.sqrt(np.square(e).sum(axis=0) / (N - 1)))
 
 
 def weighted_chi_square_tail(value: float, weights: Array) -> float:

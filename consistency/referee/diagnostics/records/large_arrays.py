@@ -10,6 +10,7 @@ import numpy as np
 from consistency.referee.types import Array
 
 ROWS = 2**18  # pairs of run and step in a block
+FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
 FEWER = 2**16  # in a block of whole runs, which lies together in memory: what is worked out of it stays in the cache
 
 
@@ -24,10 +25,12 @@ def diagonal(deviations: Array) -> Array:
 
 def every_entry(holds: Callable[[Array], Array], matrices: Array) -> Array:
     """Where ``holds``, asked of arrays (...), is true of every entry of matrices (..., n, n); (...) of bool."""
+    n = matrices.shape[-1]
+    if n > FEW:
+        return np.asarray(holds(matrices).all(axis=(-2, -1)))
     out = np.ones(matrices.shape[:-2], bool)
-    for i in range(matrices.shape[-2]):
-        for j in range(matrices.shape[-1]):
-            out &= holds(matrices[..., i, j])  # a sum over so short an axis is slow
+    for i, j in np.ndindex(n, n):
+        out &= holds(matrices[..., i, j])
     return out
 
 

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
+from consistency.referee.diagnostics.records.large_arrays import FEW, block_slices, by_runs
 from consistency.referee.types import Array
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
 NUMBERS = 2**22  # of matrices that are factored in one call
-FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 

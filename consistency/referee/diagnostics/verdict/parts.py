@@ -201,6 +201,7 @@ class Shape:
     stated: float
     wrong_sign: bool = False  # of the correlation, beyond doubt
     alone: bool = False  # and no component is wrong by itself, so that a fault of the scale is its
+    shown: bool = False  # the correlation is wrong beyond doubt, whatever the factors on the components
 
 
 @dataclass(frozen=True)

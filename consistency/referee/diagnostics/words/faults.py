@@ -10,6 +10,7 @@ from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Findings
+from consistency.referee.diagnostics.words.blocks import block_text, unlike_ratios, unlike_text
 from consistency.referee.diagnostics.words.numbers import (
     is_uncertain,
     off_by,
@@ -52,8 +53,13 @@ def scale_text(v: Findings) -> str:
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = _size_text(v, inflation, about) + _where(v)
-    text += _first_visible(v)
+    text = _size_text(v, inflation, about)
+    blocks = ""
+    if not about:
+        blocks = block_text(v)
+    if blocks:
+        return f"{text}{_first_visible(v)}: {blocks}"
+    text += _where(v) + _first_visible(v)
     if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
         text += _contrary_axis(v)
     return text
@@ -86,7 +92,7 @@ def _where(v: Findings) -> str:
 
 def combination_text(v: Findings) -> str:
     """The two components whose correlation is least as stated, where no component is shown to be wrong by itself."""
-    if v.shape is None or v.shape.pair is None or v.axes is None:
+    if v.shape is None or v.shape.pair is None or not v.shape.shown or v.axes is None:
         return "in a combination of axes"
     a, b = (v.axes.names[i] for i in v.shape.pair)
     return f"in a combination of {a} and {b} (correlation {v.shape.actual:+.2f}, stated {v.shape.stated:+.2f})"
@@ -251,8 +257,11 @@ def _sigmas(value: float) -> str:
     return f"{value:+.1e}"
 
 
-def shape_text(v: Findings) -> str:
-    """The two axes that are correlated least as stated, where it can be seen."""
+def shape_text(v: Findings, scale: str = "") -> str:
+    """Two axes whose correlation is shown to be wrong; otherwise the factors of blocks or axes, where these differ.
+
+    '' where the sentence on the ``scale`` has these factors.
+    """
     assert v.shape is not None
     assert v.axes is not None
     shape = v.shape
@@ -262,7 +271,7 @@ def shape_text(v: Findings) -> str:
         where = f" in {v.place(shape.step or 1)}"
         worth_a_word = NOTABLE
     gap = abs(shape.actual - shape.stated)
-    if shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
+    if shape.shown and shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
         what = "covariance of the wrong shape: correlation"
         if shape.wrong_sign:
@@ -271,9 +280,14 @@ def shape_text(v: Findings) -> str:
         if shape.alone:
             text += "; no axis by itself is wrong"
         return text
-    if "shape" in v.faults:
+    if shape.alone:
+        return f"covariance of the wrong shape{where}; no axis by itself is wrong"
+    off = list(unlike_ratios(v).values())[:MOST]
+    if not off:
         return f"covariance of the wrong shape{where}"
-    return f"covariance of the wrong shape{where}: axes are wrong by different factors"
+    if all(off_by(ratio) in scale for ratio in off):
+        return ""
+    return f"unlike factors: {unlike_text(v)}"
 
 
 def tails_text(v: Findings) -> str:

@@ -161,10 +161,12 @@ def _fault(v: Findings, s: Scale) -> str:
         found.append((tails_text(v), ["outliers"]))
     if of_bias:
         found.append((bias_text(v, "bias" not in v.faults), BIAS))
+    scale = ""
     if of_scale and v.status not in ("biased", "heavy-tailed"):
-        found.append((scale_text(v), SCALE))
+        scale = scale_text(v)
+        found.append((scale, SCALE))
     if _any_of(SHAPE, v.faults) and v.status not in ("biased", "heavy-tailed"):
-        found.append((shape_text(v), SHAPE))
+        found.append((shape_text(v, scale), SHAPE))
     if JOINT in v.faults and v.joint is not None and v.status != "heavy-tailed":
         found.append((joint_text(v, v.joint), [JOINT]))
     found.sort(key=lambda one: _rank(v, one[1]))

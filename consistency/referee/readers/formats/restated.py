@@ -160,8 +160,7 @@ def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:
     if head is not None and roles is not None and not (head.comment and roles.is_tum):
         deviations = len(roles.covariance) in SIZES and not roles.squared
         return _of_numbers(path, roles.covariance, run, r, not deviations)
-    with opened(path) as file:
-        width = next((len(fields_of(line)) for raw in file if _is_row(line := raw.decode("utf-8-sig"))), 0)
+    width = _width(path)
     if width not in (DEVIATED, POSE_COLUMNS + FULL, POSE_COLUMNS + TRIANGLE):
         return None
     return _of_numbers(path, range(POSE_COLUMNS, width), run, r, width != DEVIATED)
@@ -169,13 +168,18 @@ def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:
 
 def _covariances(path: Path, run: int, r: Reading) -> TextFile | None:
     """A file of lines of t and a covariance."""
-    with opened(path) as file:
-        width = next((len(fields_of(line)) for raw in file if _is_row(line := raw.decode("utf-8-sig"))), 0)
+    width = _width(path)
     return _of_numbers(path, range(1, width), run, r, True) if width in (1 + FULL, 1 + TRIANGLE) else None
 
 
-def _is_row(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
+def _width(path: Path) -> int:
+    """Numbers in the first row of a file."""
+    with opened(path) as file:
+        for raw in file:
+            line = raw.decode("utf-8-sig").strip()
+            if line and not line.startswith("#"):
+                return len(fields_of(line))
+    return 0
 
 
 def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, squared: bool) -> TextFile | None:

@@ -277,7 +277,10 @@ def _same_stem(folder: Path, path: Path, option: str) -> Path:
         return folder / path.stem
     matches = [other for other in (*trajectory_files(folder), *table_files(folder)) if other.stem == path.stem]
     if not matches:
-        raise InputError(f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum, or table, for {path}")
+        raise InputError(
+            f"{option} {folder}: holds no file '{path.stem}' with .txt or .tum, or table, for {path}; files of the two "
+            "folders are paired by name"
+        )
     return matches[0]
 
 

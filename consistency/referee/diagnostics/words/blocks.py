@@ -60,11 +60,11 @@ def unlike_text(v: Findings) -> str:
     if len(right) > MOST and len(right) == len(others):
         texts.append("the others right")
     elif 1 <= len(right) <= MOST:
-        texts.append(f"{listed(right)} right")
+        texts.append(f"{names_in_a_row(right)} right")
     return ", ".join(texts)
 
 
-def listed(names: list[str]) -> str:
+def names_in_a_row(names: list[str]) -> str:
     """A, b and c."""
     *first, last = names
     if not first:

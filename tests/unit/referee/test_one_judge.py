@@ -138,9 +138,12 @@ def test_looks_go_on_until_all_are_decided():
 
 @pytest.mark.parametrize("parts", [(), ((0,), (1,), (2,))])
 def test_a_record_that_shows_nothing_is_undecided(parts):
-    """Whatever its errors are, whole or each component by itself; a failure is one nevertheless."""
-    given = replace(record(3.0, unshown="pieces are too few"), parts=parts)
-    verdict = judge(given)
+    """Whether its errors are right or not, whole or each component by itself; a failure is one nevertheless."""
+    wrong = judge(replace(record(3.0, unshown="pieces are too few"), parts=parts))
+    assert (wrong.status, wrong.faults) == ("undecided", ())
+    given = replace(record(unshown="pieces are too few"), parts=parts)
+    assert judge(replace(given, unshown=""), Settings(detect=1e3)).status == "consistent"
+    verdict = judge(given, Settings(detect=1e3))
     assert (verdict.status, verdict.faults, verdict.unshown) == ("undecided", (), "pieces are too few")
     ratio = f"the covariance ratio would be {ratio_text(verdict.scale.inflation)} if they are, reported and not judged"
     assert verdict.reasons[0] == f"undecided: pieces are too few; {ratio}"

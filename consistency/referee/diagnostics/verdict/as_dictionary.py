@@ -10,7 +10,6 @@ from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.diagnostics.verdict.parts import (
     Bias,
     ByGroup,
-    ComponentRatios,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -68,8 +67,8 @@ def equivalence_numbers(equivalence: Equivalence | None) -> Numbers | None:
     return vars(equivalence) | {"shown": equivalence.shown}
 
 
-def lost_numbers(lost: Lost) -> Numbers:
-    return {"lost": dict(vars(lost))}
+def lost_numbers(asked: float | None, lost: Lost) -> Numbers:
+    return {"lost": {"asked": asked} | vars(lost)}
 
 
 def location_numbers(location: Location) -> Numbers:
@@ -87,17 +86,6 @@ def location_numbers(location: Location) -> Numbers:
         "subset": location.subset,
         "until": until,
     }
-
-
-def axes_numbers(axes: ComponentRatios) -> Numbers:
-    numbers: Numbers = {
-        "axes": axes.names,
-        "groups": {key: list(index) for key, index in axes.groups.items()},
-        "of_axes": {key: tuple(interval) for key, interval in axes.inflation.items()},
-    }
-    if axes.largest is not None:
-        numbers |= {"largest": tuple(axes.largest), "largest_direction": axes.direction}
-    return numbers
 
 
 def bias_numbers(bias: Bias) -> Numbers:

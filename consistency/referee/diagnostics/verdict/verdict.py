@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -268,6 +269,25 @@ class Verdict(Findings):
         return shown_by("plot", self.record, self, path)
 
 
+def _axes_numbers(v: Verdict, axes: ComponentRatios) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        "axes": axes.names,
+        "groups": {key: list(index) for key, index in axes.groups.items()},
+        "of_axes": {key: tuple(interval) for key, interval in axes.inflation.items()},
+        "impossible": [list(pair) for pair in v.impossible],
+    }
+    for key, axis in (("worst_axis", v.worst_axis), ("axis", v.axis)):
+        if axis is not None:
+            numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
+    if axes.largest is not None:
+        numbers |= {"largest": tuple(axes.largest), "largest_direction": axes.direction}
+    return numbers
+
+
+def _guess_numbers(guesses: Mapping[str, ConventionResult]) -> dict[str, Any]:
+    return {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}
+
+
 def _map_numbers(score: MapScore) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "map_ratio": score.ratio.value,
@@ -300,36 +320,27 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
     }
     parts: list[tuple[Any, Callable[[Any], dict[str, Any]]]] = [
         (v.scale, dictionary.scale_numbers),
-        (v.lost, dictionary.lost_numbers),
+        (v.lost, partial(dictionary.lost_numbers, v.settings.lost)),
         (v.location, dictionary.location_numbers),
-        (v.axes, dictionary.axes_numbers),
+        (v.axes, partial(_axes_numbers, v)),
         (v.bias, dictionary.bias_numbers),
         (v.shape, dictionary.shape_numbers),
         (v.tails, dictionary.tails_numbers),
         (v.innovations, dictionary.innovations_numbers),
         (v.accuracy, vars),
         (v.map, _map_numbers),
+        (v.landmarks, lambda labels: {"landmarks": list(labels)}),
         (v.joint, dictionary.joint_numbers),
         (v.rejection, dictionary.rejection_numbers),
         (v.ends, dictionary.ends_numbers),
         (v.skipped, dictionary.skipped_numbers),
+        (v.guesses or None, _guess_numbers),
         (v.truth, dictionary.truth_numbers),
         (v.by_group, dictionary.group_numbers),
     ]
     for part, numbers_of in parts:
         if part is not None:
             numbers |= numbers_of(part)
-    if v.lost is not None:
-        numbers["lost"]["asked"] = v.settings.lost
-    if v.axes is not None:
-        numbers["impossible"] = [list(pair) for pair in v.impossible]
-        for key, axis in (("worst_axis", v.worst_axis), ("axis", v.axis)):
-            if axis is not None:
-                numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
-    if v.landmarks is not None:
-        numbers["landmarks"] = list(v.landmarks)
-    if v.guesses:
-        numbers["guesses"] = {kind: guess._asdict() for kind, guess in v.guesses.items()}
     of_parts = {name: dictionary.group_numbers(part.by_group)["by"] for name, part in v.parts.items() if part.by_group}
     if of_parts:
         numbers["by_part"] = of_parts

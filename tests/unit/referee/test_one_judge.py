@@ -28,6 +28,7 @@ from consistency.referee.diagnostics.verdict.answers import (
 )
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import ratio_text
+from consistency.referee.gating.found import GateResult, runs_to_decide
 from consistency.referee.types import Failure
 
 RUNS = 24
@@ -282,3 +283,9 @@ def test_a_failed_run_is_no_verdict_of_the_rest():
     verdict = judge(given, Settings(false_alarm=1e-6))
     assert verdict.status == "failed"
     assert verdict.reasons[0].startswith(f"failed: 1 of {RUNS} runs failed, first run 3 in step 2: diverged")
+
+
+def test_an_undecided_gate_asks_for_more_runs_than_there_are():
+    nothing = Verdict("f", "undecided", 3, 1, Settings())
+    assert runs_to_decide(GateResult(False, False, 1.0, nothing.status, [], nothing), 3) == 4
+    assert runs_to_decide(GateResult(False, False, 1.0, "not worse", [], None), 3) == 0

@@ -15,6 +15,7 @@ from consistency.commands.shared_options import (
     Power,
     Skip,
     print_document,
+    print_next,
     reads_files,
     require_word,
     tell,
@@ -104,6 +105,6 @@ def monte_carlo_command(
     shown = document(verdicts, out.name)
     print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
     if not as_json:
-        print(f"runs in {out}; next: consistency report {out}")
+        print_next("runs", out)
     if fail_on is not None and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)

@@ -109,6 +109,16 @@ def tell_notes(*read: list[Record]) -> None:
     )
 
 
+def print_next(what: str, folder: Path) -> None:
+    """Print where results are and the command that shows them, with what that needs and is not installed."""
+    from consistency.referee.extras import missing, remedy
+
+    line = f"{what} in {folder}; next: consistency report {folder}"
+    if missing("report"):
+        line += f" (needs {remedy('report')})"
+    print(line)
+
+
 def tell(notes: Iterable[str]) -> None:
     """A line for each note on standard error."""
     from consistency.referee.parsing import one_line

@@ -22,6 +22,7 @@ from consistency.commands.shared_options import (
     Seed,
     SlurmOptions,
     given_options,
+    print_next,
 )
 from consistency.referee.errors import InputError
 
@@ -145,7 +146,7 @@ def run_command(
                     out=out, overwrite=overwrite, resume=resume, memory=memory, executor=executor,
                 )  # fmt: skip
     terminal.show(*document(verdicts or analyse(results), reasons=False).opening)
-    print(f"results in {out}; next: consistency report {out}")
+    print_next("results", out)
 
 
 def reproduce_command(

@@ -201,7 +201,7 @@ KINDS: dict[str, tuple[Callable[..., Any], str]] = {
     "text for a pose": (answers(mean=["1", "2", "3"]), "TypeError: pose() gave numbers of type <U1, not real"),
     "too few numbers": (answers(mean=np.zeros(2)), "ValueError: pose() gave an array of shape (2,), not (3,)"),
     "raises": (raises(RuntimeError("out of ideas")), "RuntimeError: out of ideas"),
-    "NaN pose": (answers(mean=np.full(3, np.nan)), "the estimate is not finite"),
+    "NaN pose": (answers(mean=np.full(3, np.nan)), "the pose is not finite"),
     "indefinite": (answers(covariance=np.diag([1.0, 1.0, -1.0])), "the pose covariance is not positive definite"),
     "singular": (answers(covariance=np.diag([1.0, 1.0, 0.0])), "the pose covariance is not positive definite"),
     "asymmetric": (answers(covariance=np.eye(3) + 1e-3 * np.eye(3, k=1)), "the pose covariance is not symmetric"),

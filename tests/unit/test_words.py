@@ -21,6 +21,9 @@ from consistency.referee.diagnostics.questions.outliers import outliers
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
+from consistency.referee.document.blocks import Reasons
+from consistency.referee.document.judged_filters import reason
+from consistency.referee.show.text import fragment
 from consistency.referee.types import Failure
 
 SURE = 1e-5
@@ -122,7 +125,16 @@ def test_failures_are_failed_unless_a_fault_is_found(rng):
         error[3, 6:] = np.nan
         verdict = judge(Record("f", error, identities(error), failures=broke), Settings(SURE))
         assert verdict.status == status
-        assert "1 of 60 runs failed, first run 3 in step 7: LinAlgError: singular" in " ".join(verdict.reasons[:2])
+        assert "1 of 60 runs failed, first run 3 in step 7: LinAlgError: singular" in verdict.reasons[0]
+    others = judge(Record("f", error / 2.0, identities(error), failures=broke), Settings(SURE))
+    assert others.reasons[1].startswith("no other fault found in 60 runs")
+    whole = (Failure("f", 3, 1, "time-out after 1 s"),)
+    hung = judge(Record("f", error / 2.0, identities(error), failures=whole), Settings(SURE))
+    assert hung.reasons[0] == "failed: 1 of 60 runs failed, first run 3: time-out after 1 s"
+    assert fragment(Reasons((reason(hung),))).startswith("f failed: 1 of 60 runs failed")
+    lost = (Failure("f", 99, 7, "KeyError: 3"),)  # a run without a map, beside 60 with one
+    of_map = judge(Record("f", error / 2.0, identities(error), failures=lost, landmarks=np.arange(20)), Settings(SURE))
+    assert of_map.reasons[0] == "failed: 1 of 61 runs failed, first run 99 in step 7: KeyError: 3"
     single = independent(rng, 1, 20, 3)
     assert judge(Record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
 

@@ -132,7 +132,7 @@ class _Unusable(Exception):
     """What a filter gave cannot be used; the message is the whole reason."""
 
 
-def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecord | None = None) -> Estimates:
+def step_through(filter_: Any, trial: Trial, belief: Belief, record: RunRecord | None = None) -> Estimates:
     """A whole trial through a filter by its ``init``, ``predict``, ``update`` and ``pose``.
 
     ``own_covariance`` is asked in each step of a filter whose error is not the additive one, ``rejected`` in each step
@@ -161,12 +161,12 @@ def step_through(filter_: Filter, trial: Trial, belief: Belief, record: RunRecor
                 raise TypeError("update must return (state, info)")
             state, info = updated
             if rejects(filter_):
-                record.rejected[: trial.first[step]] = _value_of(filter_, "rejected", state)
+                record.rejected[: trial.first[step]] = filter_.rejected(state)
             mean, covariances = _pose_and_covariances(filter_, state, error)
             if info is not None and len(info.innovation):
                 record.nis[step - 1], record.dof[step - 1] = _nis(info), len(info.innovation)
                 record.log_det[step - 1] = info.log_det
-            _require_finite("the estimate", mean, *covariances)
+            _require_finite("the pose", mean)
             rank.require(covariances)
             map_ = _map(filter_, state, trial) if step == T else None
         except (Exception, GeneratorExit, SystemExit) as exception:  # whatever a user's filter throws is a result
@@ -186,8 +186,6 @@ def reason_of(exception: BaseException) -> str:
     """Why a run failed, in one sentence, whatever the exception is."""
     if isinstance(exception, _Unusable):
         return str(exception)
-    if isinstance(exception, np.linalg.LinAlgError):
-        return "the innovation covariance is not positive definite"
     try:
         text = str(exception)
     except BaseException as error:
@@ -198,10 +196,12 @@ def reason_of(exception: BaseException) -> str:
 
 
 def _line_of(exception: BaseException) -> str:
-    """File and line where the user's code raised, in brackets; nothing where it did not."""
+    """Which method of the user's raised, and in which file and line, in brackets; empty where it was not their code."""
     frames = traceback.extract_tb(exception.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(tuple(NOT_THE_USERS))]
-    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+    if not own:
+        return ""
+    return f" (in {own[0].name}, {Path(own[-1].filename).name}:{own[-1].lineno})"
 
 
 def _nis(info: Info) -> float:
@@ -209,13 +209,16 @@ def _nis(info: Info) -> float:
     innovation = _array(info.innovation, (len(info.innovation),), "update")
     S = _array(info.S, (len(innovation), len(innovation)), "update")
     _require_finite("the innovation or its covariance", innovation, S)
-    np.linalg.cholesky(S)
+    try:
+        np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        raise _Unusable("the innovation covariance is not positive definite") from None
     nis = info.nis
     _require_finite("the NIS", nis)
     return nis
 
 
-def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Array, list[Array]]:
+def _pose_and_covariances(filter_: Any, state: Any, error: str) -> tuple[Array, list[Array]]:
     """Mean (3,) of the pose and its covariance (3, 3), with that of the filter's own error where it has one."""
     estimate = filter_.pose(state)
     if not (hasattr(estimate, "mean") and hasattr(estimate, "covariance")):
@@ -223,18 +226,11 @@ def _pose_and_covariances(filter_: Filter, state: Any, error: str) -> tuple[Arra
     mean, P = _array(estimate.mean, (3,)), _array(estimate.covariance, (3, 3))
     if error == ADDITIVE:
         return mean, [P]
-    return mean, [P, _array(_value_of(filter_, "own_covariance", state), (3, 3), "own_covariance")]
-
-
-def _value_of(filter_: Filter, method: str, state: Any) -> Any:
-    try:
-        return getattr(filter_, method)(state)
-    except np.linalg.LinAlgError as error:
-        raise _Unusable(f"LinAlgError: {error}") from error
+    return mean, [P, _array(filter_.own_covariance(state), (3, 3), "own_covariance")]
 
 
 class _Rank:
-    """Demands covariances that are symmetric and, from the first own one of full rank on, positive definite."""
+    """Demands covariances that are finite, symmetric and, from the first own one of full rank on, positive definite."""
 
     def __init__(self, error: str) -> None:
         self.names, self.full = ("the pose covariance", f"the covariance of the error '{error}'"), False
@@ -242,6 +238,7 @@ class _Rank:
     def require(self, covariances: list[Array]) -> None:
         """Raise for covariances (3, 3) that are not as they must be; the last one is of the filter's own error."""
         for name, P in zip(self.names, covariances, strict=False):
+            _require_finite(name, P)
             _require_symmetric(name, P)
         rank = definiteness(covariances[-1])
         if rank < 0 or (self.full and rank == 0):
@@ -261,11 +258,11 @@ def _require_finite(name: str, *values: Array | float) -> None:
         raise _Unusable(f"{name} is not finite")
 
 
-def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
+def _map(filter_: Any, state: Any, trial: Trial) -> Map | None:
     """What ``map`` of the filter gives, sorted by label; None without that method."""
     if not callable(getattr(filter_, "map", None)):
         return None
-    landmarks = _value_of(filter_, "map", state)
+    landmarks = filter_.map(state)
     if not isinstance(landmarks, Mapping):
         raise TypeError("map must return a dictionary of landmarks by label")
     if unknown := [label for label in landmarks if label not in range(trial.n_landmarks)]:
@@ -279,7 +276,7 @@ def _map(filter_: Filter, state: Any, trial: Trial) -> Map | None:
     )
 
 
-def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
+def _joint(filter_: Any, state: Any, labels: list[int]) -> Array | None:
     """Covariance of pose and landmarks, these sorted by label; ``labels`` in the order of ``map``.
 
     None without a method ``joint``.
@@ -287,7 +284,7 @@ def _joint(filter_: Filter, state: Any, labels: list[int]) -> Array | None:
     if not callable(getattr(filter_, "joint", None)):
         return None
     n = 3 + 3 * len(labels)
-    P = _array(_value_of(filter_, "joint", state).covariance, (n, n), "joint")
+    P = _array(filter_.joint(state).covariance, (n, n), "joint")
     _require_finite("the joint covariance of pose and map", P)
     _require_symmetric("the joint covariance of pose and map", P)
     order = np.append(0, 1 + np.argsort(labels))

@@ -226,7 +226,7 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
         if v.lost is not None:
             rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
-    if v.accuracy is not None and v.axes is not None:
+    if v.accuracy is not None and v.axes is not None and np.isfinite(v.accuracy.coverage).any():
         inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
         rows.append(("2-sigma coverage", ", ".join(inside)))
     if v.innovations is not None and np.isfinite(v.innovations.ratio):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import MapScore
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.words.numbers import short, with_subject
 from consistency.referee.document.blocks import Cell, Column, Quantity
 from consistency.referee.document.wording import NONE, PLAIN, written
 
@@ -43,7 +43,7 @@ def map_text(m: MapScore) -> str:
 
 def map_summary(m: MapScore) -> str:
     """Also the sentence of the verdict on the map."""
-    verdict = "not judged" if m.verdict is None else f"the map is {m.verdict.reasons[0]}"
+    verdict = "not judged" if m.verdict is None else with_subject("the map", m.verdict.reasons[0])
     return f"{map_text(m)}, after the last step; {verdict}"
 
 

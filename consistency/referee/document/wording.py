@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.blocks import Answer, Cell, Quantity, Reason, Status
 
 NONE = Quantity(None)
+INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
 SMALLEST = 1e-6  # p value below which digits say nothing
 
 
@@ -76,6 +78,11 @@ def brief(value: float | None) -> str:
 def p_cell(p: float) -> str:
     """A p value as a table has it."""
     return "< 1e-6" if p < SMALLEST else f"{p:.2g}"
+
+
+def unbroken(text: str) -> str:
+    """The text, in which no line ends inside an interval or before %."""
+    return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace(" %", "\u00a0%"))
 
 
 def listed(words: Sequence[str]) -> str:

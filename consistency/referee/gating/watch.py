@@ -178,8 +178,10 @@ def terms(
 
 
 def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
+    from consistency.referee.diagnostics.words.numbers import with_subject
+
     first, *rest = reasons
-    return "\n  - ".join([f"{gate}: {name} is {first}", *rest])
+    return "\n  - ".join([f"{gate}: {with_subject(name, first)}", *rest])
 
 
 def plan_invocation(dof: int, terms: Terms) -> str:

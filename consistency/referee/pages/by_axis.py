@@ -10,7 +10,8 @@ import numpy as np
 
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.document.blocks import Figure
+from consistency.referee.diagnostics.words.numbers import UNCERTAIN
+from consistency.referee.document.blocks import Block, Column, Details, Figure, Quantity, table
 from consistency.referee.document.colours import EXPECTED, solid
 from consistency.referee.pages.judged import Judged
 from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
@@ -38,8 +39,8 @@ class Forest:
     rows: tuple[Row, ...]
 
 
-def by_axis(study: Judged) -> tuple[Figure, ...]:
-    """A panel for each quantity, in which each axis has a row; nothing where no filter has any."""
+def by_axis(study: Judged) -> tuple[Block, ...]:
+    """A panel for each quantity, in which each axis has a row, and the ratios in numbers; nothing if there are none."""
     found = forests(study)
     if not found:
         return ()
@@ -54,7 +55,25 @@ def by_axis(study: Judged) -> tuple[Figure, ...]:
             axes.set_yticklabels([])
         return add_legend(figure)
 
-    return (Figure("By axis", axis_caption(study, found), (draw,), level=4),)
+    return Figure("By axis", axis_caption(study, found), (draw,), level=4), *_in_numbers(study, found)
+
+
+def _in_numbers(study: Judged, found: tuple[Forest, ...]) -> tuple[Details, ...]:
+    """The covariance ratios of the figure, as a table to unfold."""
+    ratios = [forest for forest in found if forest.name == "ratio"]
+    if not ratios:
+        return ()
+    columns = (Column("Axis"), *(Column(track.name, number=True) for track in study.tracks))
+    rows = [(name, *map(_quantity, intervals)) for name, intervals in ratios[0].rows]
+    shown = table(columns, rows, f"Covariance ratio by axis of {study.name}")
+    return (Details("Covariance ratio by axis, in numbers", (shown,)),)
+
+
+def _quantity(interval: Interval | None) -> Quantity:
+    if interval is None:
+        return Quantity(None)
+    value, low, high = interval
+    return Quantity(value, (low, high), limit=UNCERTAIN, is_factor=True)
 
 
 def row_labels(found: tuple[Forest, ...]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.words.numbers import plural, with_subject
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions, verdicts
 from consistency.referee.pages.by_axis import by_axis
@@ -32,7 +32,7 @@ def compose_files(
             name,
             name,
             (
-                *[Text(f"{name} is {_ended(verdict.reasons[0])}")] * several,
+                *[Text(with_subject(name, _ended(verdict.reasons[0])))] * several,
                 *record_figures(named[name], verdict),
                 *by_group(verdict),
             ),
@@ -55,7 +55,7 @@ def compose_files(
 
 def answer(judged: Mapping[str, Verdict]) -> str:
     """The sentence of each verdict."""
-    return " ".join(f"{name} is {_ended(verdict.reasons[0])}" for name, verdict in judged.items())
+    return " ".join(with_subject(name, _ended(verdict.reasons[0])) for name, verdict in judged.items())
 
 
 def _begun(note: str) -> str:

@@ -16,6 +16,7 @@ FAILURES = (
     Column("Step", number=True),
     Column("Reason", width="3fr"),
 )
+STEP_1 = "A run that failed in step 1 has no estimates; a hang or a crash is counted there, in whatever step it was."
 
 
 def judgement(study: Judged) -> list[Block]:
@@ -29,7 +30,7 @@ def judgement(study: Judged) -> list[Block]:
     if study.failures:
         rows: list[tuple[Cell, ...]] = [(name, str(run), str(step), why) for name, run, step, why in study.failures]
         failed = f"Failed runs of {study.name}"
-        blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}"))
+        blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}. {STEP_1}"))
     return blocks
 
 

@@ -16,7 +16,7 @@ from consistency.referee.parsing import one_line
 from consistency.referee.readers.pipeline.kinds import PROGRAM_RUNS, is_program_runs
 from consistency.referee.readers.pipeline.program_runs import ProgramStudy, study_in
 from consistency.referee.system.atomic import PARTIAL, write_whole
-from consistency.referee.system.folders import writing
+from consistency.referee.system.folders import IN_PYTHON, writing
 from consistency.referee.system.provenance import manifest_of
 
 LOCK = ".lock"
@@ -48,7 +48,9 @@ def require_usable(folder: Path, resume: bool, overwrite: bool) -> None:
     if not folder.is_dir() or not (is_program_runs(folder) or _is_begun(folder)):
         raise InputError(f"--out {folder}: is not a folder of 'consistency monte-carlo'; name another one")
     if not (resume or overwrite or _is_begun(folder)):
-        raise InputError(f"--out {folder}: exists already; choose another folder, or add --resume or --overwrite")
+        raise InputError(
+            f"--out {folder}: exists already; choose another folder, or add --resume or --overwrite {IN_PYTHON}"
+        )
 
 
 def _is_begun(folder: Path) -> bool:

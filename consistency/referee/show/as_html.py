@@ -31,7 +31,7 @@ from consistency.referee.document.blocks import (
     Text,
 )
 from consistency.referee.document.colours import Look
-from consistency.referee.document.wording import written
+from consistency.referee.document.wording import unbroken, written
 from consistency.referee.show.svg import Pictures, paint
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -46,13 +46,13 @@ def render(document: Document, pictures: Pictures | None = None) -> str:
     page = Page(paint(document) if pictures is None else pictures)
     links = [f'<li><a href="#{escape(c.anchor)}">{escape(c.link)}</a></li>' for c in document.chapters if c.link]
     contents = f'<nav aria-label="Contents"><ul>{"".join(links)}</ul></nav>' if len(links) > 1 else ""
-    answer = f'<p class="answer">{escape(document.answer)}</p>' if document.answer else ""
+    answer = f'<p class="answer">{_prose(document.answer)}</p>' if document.answer else ""
     title, script = escape(document.title), ""
     policy = "'none'"
     if any(chapter.switches for chapter in document.chapters):
         script = f"<script>{SCRIPT}</script>"
         policy = f"'sha256-{b64encode(sha256(SCRIPT.encode()).digest()).decode()}'"
-    whole = f"""<!DOCTYPE html>
+    return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -76,7 +76,6 @@ style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'">
 </body>
 </html>
 """
-    return whole.replace(" %", "&nbsp;%")  # no line begins with it
 
 
 def fragment(*blocks: Block) -> str:
@@ -112,7 +111,7 @@ class Page:
         match block:
             case Text():
                 lead = f"<strong>{escape(block.lead)}</strong> " if block.lead else ""
-                return f'<p class="{block.style}">{lead}{escape(block.text)}</p>'
+                return f'<p class="{block.style}">{lead}{_prose(block.text)}</p>'
             case Heading():
                 return f"<h{block.level}>{escape(block.text)}</h{block.level}>"
             case Reasons():
@@ -135,7 +134,7 @@ class Page:
         drawings = self.pictures.get(id(figure), ())
         if not drawings:
             return ""
-        title, caption = escape(figure.title), escape(figure.caption)
+        title, caption = escape(figure.title), _prose(figure.caption)
         charts = "\n".join(
             f'<div class="chart" role="img" tabindex="0" aria-label="{title}">{svg}</div>' for svg in drawings
         )
@@ -168,7 +167,11 @@ def _swatch(look: Look) -> str:
 
 
 def _paragraph(text: str, style: str = "") -> str:
-    return f'<p class="{style}">{escape(text)}</p>\n'
+    return f'<p class="{style}">{_prose(text)}</p>\n'
+
+
+def _prose(text: str) -> str:
+    return escape(unbroken(text))
 
 
 def _list(texts: Iterable[str]) -> str:
@@ -242,4 +245,4 @@ def _cell(cell: Cell) -> str:
         case Reason():
             return _details(cell.sentence, _list(cell.others))
         case _:
-            return escape(written(cell))
+            return _prose(written(cell))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from consistency.referee.diagnostics.words.numbers import with_subject
 from consistency.referee.document.blocks import Block, Bullets, Cell, Document, Facts, Heading, Reasons, Table, Text
 from consistency.referee.document.wording import PLAIN, written
 
@@ -23,8 +24,7 @@ def _block(block: Block) -> str:
             lines = [[_line(column.head) for column in block.columns], ["---"] * len(block.columns), *rows]
             return "\n".join(f"| {' | '.join(line)} |" for line in lines)
         case Reasons():
-            entries = (f"**{_line(e.name)}** is {_line(e.sentence)}" for e in block.entries)
-            return "\n\n".join(entries)
+            return "\n\n".join(with_subject(f"**{_line(e.name)}**", _line(e.sentence)) for e in block.entries)
         case Facts():
             return "\n".join(f"- {_line(name)}: {_line(value)}" for name, value in block.rows)
         case Bullets():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from xml.sax.saxutils import escape, quoteattr
 
+from consistency.referee.diagnostics.words.numbers import with_subject
 from consistency.referee.document.blocks import Document, Reason
 
 FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0, section 2.2
@@ -25,7 +26,8 @@ def render(document: Document) -> str:
 
 def _case(case: Reason, title: str) -> str:
     head = f"<testcase classname={_attribute(case.group or title)} name={_attribute(case.name)}>"
-    text = escape(_allowed("\n".join([f"{case.name} is {case.sentence}", *(f"- {other}" for other in case.others)])))
+    lines = [with_subject(case.name, case.sentence), *(f"- {other}" for other in case.others)]
+    text = escape(_allowed("\n".join(lines)))
     if case.has_passed:
         return f"{head}\n<system-out>{text}</system-out>\n</testcase>"
     return f"{head}\n<failure message={_attribute(case.sentence)}>{text}</failure>\n</testcase>"

@@ -15,7 +15,7 @@ import matplotlib as mpl
 import typst
 
 from consistency.referee.document import blocks
-from consistency.referee.document.wording import written
+from consistency.referee.document.wording import unbroken, written
 from consistency.referee.show.svg import Pictures, paint
 
 TEMPLATE = "report.typ"
@@ -86,8 +86,8 @@ class Paper:
 
 
 def soft(text: str) -> str:
-    """Add break points inside long words, and forbid breaks before %, so that no text runs over an edge."""
-    return LONG_WORD.sub(lambda match: match.group() + "\u200b", text.replace(" %", "\u00a0%"))
+    """Add break points inside long words, so that no text runs over an edge, and forbid some others."""
+    return LONG_WORD.sub(lambda match: match.group() + "\u200b", unbroken(text))
 
 
 def _settings(resolved: dict[str, Any]) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from consistency.referee.diagnostics.words.numbers import with_subject
 from consistency.referee.document.blocks import Block, Bullets, Facts, Heading, Reason, Reasons, Table, Text
 from consistency.referee.document.wording import PLAIN, written
 
@@ -14,9 +15,10 @@ def fragment(*blocks: Block) -> str:
 def _lines(block: Block) -> list[str]:
     match block:
         case Reasons():
-            return [
-                line for e in block.entries for line in (f"{e.name} is {e.sentence}", *(f"  - {o}" for o in e.others))
-            ]
+            lines = []
+            for entry in block.entries:
+                lines += [with_subject(entry.name, entry.sentence), *(f"  - {other}" for other in entry.others)]
+            return lines
         case Facts():
             width = max(len(name) for name, _ in block.rows)
             return [f"  {name:<{width}}  {value}" for name, value in block.rows]
@@ -36,7 +38,8 @@ def _table(table: Table) -> list[str]:
     below: list[list[str]] = [[]]
     for cells in table.rows:
         rows.append([written(cell, PLAIN) for cell in cells if not isinstance(cell, Reason)])
-        below.append([f"    {c.name} is {c.sentence}" for c in cells if isinstance(c, Reason) and not c.has_passed])
+        failed = [cell for cell in cells if isinstance(cell, Reason) and not cell.has_passed]
+        below.append([f"    {with_subject(cell.name, cell.sentence)}" for cell in failed])
     widths = [max(map(len, column)) for column in zip(*rows, strict=False)]
     lines = []
     for row, more in zip(rows, below, strict=True):

@@ -16,6 +16,8 @@ from consistency.referee.parsing import one_line, read_json
 from consistency.referee.system.atomic import left_beside, make_durable, partial_folder
 from consistency.referee.system.provenance import SCHEMA_VERSION
 
+IN_PYTHON = "(overwrite=True in Python)"
+
 # --- writing -------------------------------------------------------------------------------------
 
 
@@ -33,7 +35,7 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
         _clear(folder)
     if folder.exists() or folder.is_symlink():
         if not overwrite:
-            raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite")
+            raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite {IN_PYTHON}")
         try:
             before = read_manifest(folder).get("kind")
             if before != kind:

@@ -146,7 +146,56 @@ def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control
         cs.run_trials(world, [Still("two\nlines")], runs=1)
     exception = RuntimeError("one\n::error::two\x1b[2J\udc80")
     failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
-    assert failure.reason.startswith("RuntimeError: one ::error::two [2J\\udc80 (misbehaving.py:")
+    assert failure.reason.startswith("RuntimeError: one ::error::two [2J\\udc80 (in update, misbehaving.py:")
+
+
+def inverts(*_: Any) -> None:
+    np.linalg.inv(np.zeros((2, 2)))
+
+
+def test_an_algebra_error_of_the_users_is_theirs_and_only_a_wrong_s_is_said_of_s(
+    world: cs.Scenario, doomed: Control
+) -> None:
+    trial = cs.simulate(world, DOOMED)
+    line = inverts.__code__.co_firstlineno + 1
+    failure = run_filter(Still("bad", inverts, doomed), trial, world.belief).failure
+    assert failure.reason == f"LinAlgError: Singular matrix (in update, test_isolating.py:{line})"
+    wrong = answers(innovation=np.ones(3), S=-np.eye(3))
+    failure = run_filter(Still("bad", wrong, doomed), trial, world.belief).failure
+    assert failure.reason == "the innovation covariance is not positive definite"
+
+
+def test_an_error_of_the_map_names_the_map(world: cs.Scenario) -> None:
+    class Mapping(Still):
+        def map(self, state: Any) -> Any:
+            return {}["x"]
+
+    failure = run_filter(Mapping("bad"), cs.simulate(world), world.belief).failure
+    assert failure.reason.startswith("KeyError: 'x' (in map, test_isolating.py:")
+
+
+@pytest.mark.parametrize("entry", [(0, 0), (2, 1)])
+def test_a_covariance_that_is_not_finite_is_told_from_a_pose(
+    world: cs.Scenario, doomed: Control, entry: tuple[int, int]
+) -> None:
+    P = np.eye(3)
+    P[entry] = np.nan
+    failure = run_filter(Still("bad", answers(covariance=P), doomed), cs.simulate(world, DOOMED), world.belief).failure
+    assert (failure.step, failure.reason) == (STEP, "the pose covariance is not finite")
+
+
+def test_a_class_that_travels_by_value_has_the_file_it_came_from(world: cs.Scenario, doomed: Control) -> None:
+    """Some versions of cloudpickle keep the name of the file, others write one of their own; the script has it."""
+    names: dict[str, Any] = {}
+    exec(compile("def act(*_):\n    raise KeyError('landmark 17')\n", "<dynamic-code>", "exec"), names)
+    with Isolation([Script("bad", names["act"], doomed)], world.belief) as isolation:
+        [said] = isolation.run(cs.simulate(world, DOOMED))
+    assert said.failure.step == STEP
+    assert said.failure.reason == "KeyError: 'landmark 17' (in update, test_isolating.py:2)"
+
+
+class Script(Still):
+    """A filter whose file is this one."""
 
 
 @pytest.mark.parametrize("exception", [SystemExit("enough"), GeneratorExit("gone"), RuntimeError("x" * 10**6)])

@@ -134,12 +134,13 @@ def test_a_filter_that_breaks_at_once(xyz):
     assert len(results.estimates) == 0
     assert list(results.failures["step"]) == [1, 1, 1]
     (reason,) = set(results.failures["reason"])
-    place = re.fullmatch(r"KeyError: 'no such map' \(test_montecarlo\.py:(\d+)\)", reason)
+    place = re.fullmatch(r"KeyError: 'no such map' \(in init, test_montecarlo\.py:(\d+)\)", reason)
     assert "raise KeyError" in Path(__file__).read_text("utf-8").splitlines()[int(place[1]) - 1]
     verdict = cs.analyse(results)["stillborn"]
     assert verdict.status == "failed"
     assert verdict.statistics["runs"] == 3
-    assert any("3 of 3 runs failed" in reason for reason in verdict.reasons)
+    assert verdict.reasons[0] == f"failed: 3 of 3 runs failed, first run 0: {reason}"
+    assert "coverage" not in str(verdict)
 
 
 def test_a_compiled_filter_that_breaks(small):

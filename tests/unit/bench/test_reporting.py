@@ -178,7 +178,7 @@ class Page(HTMLParser):
     def handle_data(self, data):
         if self.tags and self.tags[-1] == "style":
             self.style += data
-        self.text.append(data.replace("\u00a0%", " %"))
+        self.text.append(data.replace("\u00a0", " "))
 
 
 def test_the_model_is_what_analyse_says(folder):
@@ -384,6 +384,8 @@ def test_every_status_is_shown_with_its_meaning(report):
     for part in (f"({meaning})" for meaning in STATUSES.values()):
         assert part in text
     source = shown(report)
+    assert "LinAlgError: singular" in source
+    assert "a hang or a crash is counted there, in whatever step it was" in source
     for status in STATUSES:
         assert f'<span class="verdict {status}">{status}</span>' in source
 
@@ -651,6 +653,7 @@ def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_w
     report = build_report(folder)
     page = shown(report)
     assert "How far the referee can be trusted" in page
+    assert "<details><summary>Measured rates</summary>" in page
     assert "steps that &lt;depend&gt; on each other" in page
     assert "plan keeps its word" in page
     assert printed(report).startswith(b"%PDF")

@@ -19,6 +19,7 @@ from consistency.bench import filters
 from consistency.bench.sweeps.plan import load_sweep
 from consistency.commands.app import app
 from consistency.commands.registry import COMMANDS
+from consistency.commands.shared_options import print_next
 from consistency.referee import extras
 from consistency.referee.extras import (
     IMPORT_NAMES,
@@ -422,3 +423,12 @@ def test_what_does_not_fit_a_sensor_is_said_without_it(xyz):
     with pytest.raises(cs.InputError, match="works on a sensor uvd, not 'xyz'; filters that fit: ekf-xyz") as refusal:
         cs.run_trials(xyz, ["ekf-uvd"], runs=1)
     assert "gtsam" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("absent", [[], ["typst"]])
+def test_the_next_command_names_what_it_lacks(absent, monkeypatch, capsys):
+    monkeypatch.setattr(extras, "missing", lambda *_: absent)
+    print_next("runs", Path("out"))
+    shown = capsys.readouterr().out
+    assert shown.startswith("runs in out; next: consistency report out")
+    assert ("(needs typst: pip install " in shown) == bool(absent)

@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.fit_covariance.correction_files import place_in
+from consistency.referee.fit_covariance.fit_folder import toml
 
 RUNS, DRIVES, STEPS = 24, 8, 20
 
@@ -257,6 +259,14 @@ def test_named_runs_alone_are_held_out(tables, tmp_path, capsys):
     assert len({line.split(",")[0] for line in lines}) == RUNS
 
 
+def test_held_out_has_the_files_of_judged_runs_alone(rng, tmp_path, capsys):
+    estimates = write_trajectories(tmp_path / "tum", rng)
+    options = ("--truth", tmp_path / "tum/truth", "--held-out", "run01,run06", "--anyway", "--out", tmp_path / "c")
+    consistency(capsys, "correct", estimates, *options)
+    assert sorted(path.name for path in (tmp_path / "c/held-out").iterdir()) == ["run01.txt", "run06.txt"]
+    assert len(list((tmp_path / "c/corrected").iterdir())) == DRIVES
+
+
 def test_one_log_is_cut_into_pieces(tmp_path, capsys):
     rng = np.random.default_rng(4)
     errors = 2.0 * rng.normal(size=(1, 2000, 2))
@@ -384,6 +394,25 @@ def test_a_folder_is_read_in_python_as_by_the_command(tmp_path):
     assert [block.name for block in found.blocks] == ["position", "attitude"]
     values = found.fit.factors.factor
     assert values == pytest.approx([9.0, 1.0], rel=0.3)
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="tomllib is of Python 3.11")
+def test_numbers_tables_and_lists_of_tables_are_toml():
+    import tomllib
+
+    values = {
+        "name": 'a "b"\nc',
+        "none": None,
+        "ends": [1.5, None],
+        "table": {"x": 1, "inner": {"y": True}},
+        "rows": [{"z": 1, "deep": {"w": 2.0}}, {"z": 2}],
+        "referee": {"long": 1},
+    }
+    text = toml("two lines\nof comment", values)
+    assert text.startswith("# two lines\n# of comment\n")
+    read = tomllib.loads(text)
+    assert str(read.pop("ends")) == "[1.5, nan]"
+    assert read == {key: values[key] for key in ("name", "table", "rows")}
 
 
 # --- examples with public data ----------------------------------------------------------------------------------------

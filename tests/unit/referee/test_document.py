@@ -36,7 +36,7 @@ from consistency.referee.document.guard import rejection_cells, rejection_text
 from consistency.referee.document.judged_filters import FURTHER, TERMINAL, cells, document, page, with_values
 from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
 from consistency.referee.document.needed_runs import plan_lines
-from consistency.referee.document.wording import PLAIN, PRINTED, written
+from consistency.referee.document.wording import PLAIN, PRINTED, unbroken, written
 from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal, text
 
 INF, NAN = float("inf"), float("nan")
@@ -190,6 +190,13 @@ def test_one_document_says_the_same_on_the_terminal_and_in_files():
         assert f"{name} is {v.reasons[0]}" in text.fragment(*tree.opening)
         assert f"**{name}** is {v.reasons[0]}" in as_md.render(tree)
     assert not list(document(verdicts, reasons=False).reasons)
+
+
+def test_intervals_and_percentages_stay_on_one_line():
+    text = "too small by x3.27 [1.91, 6.60], in 95 % of runs, [a, b c]"
+    assert unbroken(text) == "too small by x3.27 [1.91,\u00a06.60], in 95\u00a0% of runs, [a, b c]"
+    cell = as_html.render(Document("", "", (), (table((Column("a"),), [(text,)], "t"), Text(text))))
+    assert cell.count("[1.91,\u00a06.60], in 95\u00a0%") == 2
 
 
 def test_a_verdict_prints_itself_by_the_renderers():

@@ -307,6 +307,7 @@ def test_without_a_true_velocity_the_pose_is_judged(inside):
     "options, said",
     [
         ({}, r"est\.csv: holds a covariance of poses with their velocity, whose error is not known; add --error so3"),
+        ({"error": "guess"}, r"add --error so3, so3-body, left, right, additive \('guess' is for poses alone\)"),
         ({"error": "left", "axes": ["bgx"]}, r"--axes bgx: 'bgx' is not one of x, y, z, roll, pitch, yaw, vx, vy, vz$"),
     ],
 )

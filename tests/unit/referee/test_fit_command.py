@@ -20,6 +20,7 @@ import consistency as cs
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.drives import drive_of
+from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.writing import (
     ceres,
     gtsam,
@@ -100,6 +101,17 @@ def test_a_window_that_is_left_out_begins_another_run(rng, tmp_path):
     write_model(model, tmp_path / "out")
     record = cs.read(tmp_path / "out" / "motions.csv", truth=tmp_path / "out" / "truth.csv", relative=1, motions=True)
     assert np.isfinite(np.asarray(record.nees)).sum() == model.counts["windows"]
+
+
+def test_motions_without_a_clock_have_no_column_of_it(planar, tmp_path):
+    stretches = planar.stretches
+    for name, t in (("clock", stretches[0].t), ("none", np.full(len(stretches[0].t), np.nan))):
+        (tmp_path / name).mkdir()
+        write_motions([replace(stretches[0], t=t)], tmp_path / name)
+        head, first = (tmp_path / name / "motions.csv").read_text().splitlines()[:2]
+        assert head.startswith("run,step,t,x,y,heading,P_" if name == "clock" else "run,step,x,y,heading,P_")
+        assert head.count(",") == first.count(",")
+        assert (tmp_path / name / "truth.csv").read_text().splitlines()[0] == head[: head.index(",P_")]
 
 
 # --- other programs --------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def test_failed_runs_are_counted_and_the_others_judged(error):
     assert verdict.scale.alive.tolist() == [59] * 4 + [58] * 8 + [57] * 8
     fault = cs.judge(3.0 * error, P, false_alarm=SURE)
     assert fault.status == "overconfident"
-    assert "3 of 60 runs failed" in fault.reasons[1]
+    assert "; 3 of 60 runs failed, first run 3 in step 13: " in fault.reasons[0]
 
 
 def test_a_known_start_is_left_out_by_name(error):

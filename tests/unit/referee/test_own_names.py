@@ -242,6 +242,14 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
     record = cs.read(tmp_path / "est", tmp_path / "truth", columns=names)
     assert record.nees is not None
     assert record.nees.shape == (2, STEPS)
+    for missing, word in (("x", "pn"), ("t", "clock")):  # of the truth: a file with names is not read as one without
+        own = table(
+            tmp_path / f"{word}.csv", [word if name == missing else name for name in [*POSE, "vn"]], true, P[:, 0, 0]
+        )
+        with pytest.raises(
+            cs.InputError, match=rf"{word}\.csv: column '{missing}' is missing; there are: .*, vn; --columns"
+        ):
+            cs.read(tmp_path / "est" / "0.csv", own, columns=names)
 
 
 @pytest.mark.parametrize(

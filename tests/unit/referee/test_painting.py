@@ -218,6 +218,31 @@ def test_a_legend_has_each_label_once_and_room_of_its_own():
     assert not legend_of(drawn(partial(draw, legend=True)))
 
 
+def test_rows_of_a_legend_are_nearly_as_long_as_each_other():
+    def five():  # names of which four have room in a row
+        figure, (axes,) = canvas(2.0)
+        for name in "abcde":
+            curve(axes, STEPS, STEPS, style(0), name * 14)
+        return add_legend(figure)
+
+    figure = drawn(five)
+    figure.draw_without_rendering()
+    places_of = [text.get_window_extent().x0 for text in figure.legends[0].get_texts()]
+    assert len(set(places_of)) == 3
+
+
+def test_the_ground_of_a_picture_is_that_of_the_page():
+    text = svg(partial(draw, lambda axes: curve(axes, np.arange(2.0), np.zeros(2), Look("#000"))))
+    assert "fill: #ffffff" not in text
+
+
+def test_a_picture_that_scrolls_is_reached_by_the_keyboard():
+    figure = Figure("NEES", "", (draw,))
+    assert '<div class="chart" role="img" tabindex="0" aria-label="NEES">' in as_html.render(
+        Document("", "", (), (figure,))
+    )
+
+
 def test_a_panel_has_a_legend_of_its_own():
     axes = axes_of(lambda axes: curve(axes, STEPS, STEPS, style(0), "$x$"), panel_legend)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["$x$"]

@@ -317,7 +317,8 @@ def test_each_failed_run_is_named_and_counted(place, capsys):
     status, out, err = monte_carlo(*words, capsys=capsys)
     assert status == 1
     assert "7 of 20 runs failed" in out
-    assert "1 run failed (3): it ended with status 3; log out/runs/0003/program.log" in err.replace(f"{place}/", "")
+    expected = f"1 run failed (3): it ended with status 3; log out/runs/0003/program.log, seed {seed_of(0, 3)}"
+    assert expected in err.replace(f"{place}/", "")
     expected = {
         3: "it ended with status 3; its log ends: no inverse",
         4: "it was killed by SIGSEGV",
@@ -376,6 +377,7 @@ def test_a_table_that_ends_before_those_of_most_runs_has_failed(place, capsys):
     words = ("--runs", "8", "--out", "out", "--overwrite", "--", "./filter", "{run}")
     monte_carlo("--keep", "failed", *words, capsys=capsys)
     assert failures(place / "out", capsys) == {4: "its estimates end at 3, those of most runs at 4"}
+    assert "first run 4: its estimates end at 3" in str(cs.judge(cs.read(place / "out")))  # and not in some step
     assert run_files(place / "out", "estimates.csv") == ["0004"]
     script(place, COPY + "\n[ $1 -gt 2 ] && sed -i '$d' estimates.csv; exit 0")  # runs of any length
     monte_carlo(*words, capsys=capsys)
@@ -431,7 +433,7 @@ def test_missing_runs_are_done_in_new_folders(place, capsys):
         '{"kind": "mine", "run": 5, "values": {}, "failure": "", "seconds": 0}'
     )  # of the program itself
     kept = (runs / "0003/estimates.csv").stat().st_mtime_ns
-    assert "exists already" in monte_carlo(*words, capsys=capsys)[2]
+    assert "add --resume or --overwrite (overwrite=True in Python)" in monte_carlo(*words, capsys=capsys)[2]
     status, after, _ = monte_carlo("--resume", *words, capsys=capsys)
     assert (status, after) == (0, before)
     assert (runs / "0003/estimates.csv").stat().st_mtime_ns == kept

@@ -14,7 +14,7 @@ from recorded import read_recordings
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.document.blocks import Figure, Table, Text
+from consistency.referee.document.blocks import Details, Figure, Table, Text
 from consistency.referee.pages.files_report import compose_files
 from consistency.referee.pages.judged import clock_of
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, unit_of
@@ -56,6 +56,23 @@ def test_the_verdict_stands_on_top_and_the_pictures_first(archive):
     assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
 
 
+def test_notes_are_sentences_and_paths_stay_as_they_are(archive):
+    record = replace(cs.read(archive), notes=("g2/est/a.csv: read as poses", "error convention so3"))
+    made = compose_files([record], {"mine": cs.judge(record)}, "mine.npz", {})
+    texts = [block.text for block in made.chapters[-1].blocks if isinstance(block, Text)]
+    assert texts == ["g2/est/a.csv: read as poses.", "Error convention so3."]
+
+
+def test_ratios_by_axis_stand_in_numbers_too(archive):
+    verdict = cs.judge(cs.read(archive))
+    (found,) = [block for block in document(archive).chapters[1].blocks if isinstance(block, Details)]
+    (shown,) = found.blocks
+    for name, quantity in shown.rows:
+        ratio = verdict.scale.inflation if name == "all axes" else verdict.axes.inflation[name]
+        assert (quantity.value, *quantity.interval) == tuple(ratio)
+    assert [name for name, _ in shown.rows][-1] == "all axes"
+
+
 def test_what_the_files_do_not_tell_has_no_column(archive):
     (shown,) = [block for block in document(archive).chapters[1].blocks if isinstance(block, Table)][:1]
     heads = [column.head for column in shown.columns]
@@ -68,7 +85,7 @@ def test_the_cells_of_a_wide_table_name_their_heads(archive, tmp_path, capsys):
     """A narrow screen shows each row of it by itself."""
     consistency(capsys, "analyse", archive, "--report", tmp_path / "r")
     source = (tmp_path / "r/report.html").read_text("utf-8")
-    wide, narrow = re.findall(r"<table.*?</table>", source, re.S)
+    wide, narrow, _ = re.findall(r"<table.*?</table>", source, re.S)
     heads = [re.sub(r"<.*?>", "", head) for head in re.findall(r"<th scope=\"col\".*?>(.*?)</th>", wide)]
     assert re.findall(r'data-head="(.*?)"', wide) == heads[1:]
     assert 'wide">' in wide
@@ -244,7 +261,7 @@ def test_a_report_that_is_not_replaced_is_refused_before_the_work(archive, tmp_p
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine.txt").write_text("mine")
-    why = f"--report {taken}: exists already; choose another folder or add --overwrite"
+    why = f"--report {taken}: exists already; choose another folder or add --overwrite (overwrite=True in Python)"
     assert why in refused(capsys, "analyse", archive, "--report", taken)
     other = tmp_path / "junit.xml"
     other.write_text("<testsuites></testsuites>\n")

@@ -191,7 +191,7 @@ FAILURES = {
 def test_a_run_that_is_no_estimate_has_failed(what, reason, rng):
     """It is counted, fails the gate, and the others are judged beside it; no number of runs makes up for it."""
     errors, covariances = spoilt(what, rng, RUNS)
-    match = rf"mine is failed: 1 of {RUNS} runs failed, first run 4 in step 7: {reason}"
+    match = rf"mine failed: 1 of {RUNS} runs failed, first run 4 in step 7: {reason}"
     with pytest.raises(ConsistencyError, match=match) as caught:
         gate(errors, covariances, name="mine")
     verdict = caught.value.verdict

@@ -110,6 +110,16 @@ WRONG = {
     "binary": (lambda at: (at / "est.csv").write_bytes(b"\xff\xfe\x00PAR1"), ("est.csv",), "est.csv: not a text file"),
     "column twice": (raw("x,x\n1,2\n"), EST, "column 'x' is duplicated"),
     "no truth": (csv(), ("est.csv",), "needs --truth FILE, or columns nis and nis_dof"),
+    "some of the truth beside it": (
+        csv(lambda e: e.assign(true_x=0.0, true_y=0.0, true_head=0.0)),
+        ("est.csv",),
+        "column 'true_heading' is missing; there are: run, step, ",
+    ),
+    "truth of another state beside it": (
+        csv(lambda e: e.assign(true_x=0.0, true_vx=0.0)),
+        ("est.csv",),
+        "the state is x,y,heading: --state names another, and --columns true_y=NAME that column",
+    ),
     "missing state of the truth": (csv(None, columns("y")), EST, "truth.csv: column 'y' is missing"),
     "other state": (csv(), (*EST, "--state", "x,vx"), "est.csv: column 'vx' is missing"),
     "state twice": (csv(), (*EST, "--state", "x,x"), "--state x,x: needs names of columns, each once"),
@@ -227,7 +237,7 @@ WRONG = {
     "truth of another run": (
         lambda at: [(text()(at)), (at / "d").mkdir(), (at / "e").mkdir(), (at / "d/a.txt").write_text(TUM)],
         ("d", "--truth", "e", "--covariance", "e"),
-        "--truth e: holds no file 'a' with .txt or .tum",
+        "or table, for d/a.txt; files of the two folders are paired by name",
     ),
     "one covariance of many runs": (
         lambda at: [(text()(at)), (at / "d").mkdir(), (at / "d/a.txt").write_text(TUM)],

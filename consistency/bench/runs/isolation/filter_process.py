@@ -18,6 +18,7 @@ from functools import cache
 from multiprocessing import current_process
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any
 
 from consistency.bench.filters.compiled import Compiled
@@ -271,7 +272,8 @@ def _isolated(filter_: Filter) -> Isolated:
             f"filter '{name}' runs in a process of its own and cannot be pickled: {reason_of(error)}; "
             "make in init(problem) what cannot be"
         ) from None
-    return Isolated(name, error_of(filter_), rejects(filter_), pickled)
+    file = getattr(sys.modules[type(filter_).__module__], "__file__", None) or ""
+    return Isolated(name, error_of(filter_), rejects(filter_), pickled, Path(file).name)
 
 
 def _folder() -> str:

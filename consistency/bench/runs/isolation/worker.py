@@ -8,7 +8,7 @@ import os
 import pickle
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,6 +24,7 @@ from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
 
 GIB = 2**30
+BY_VALUE = "<dynamic-code>"  # cloudpickle's name for the file of a class that travels by value, as those of a script
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Isolated:
     error: str
     guarded: bool  # whether it says which observations it left out
     pickled: bytes
+    file: str  # name of the file of its class; empty where it has none, as in a notebook
 
     def failed(self, trial: Trial, reason: str) -> Estimates:
         """Return estimates without a step: the run has failed in its first."""
@@ -70,6 +72,9 @@ def run(filter_: Isolated, trial: Trial, belief: Belief, memory: float | None) -
         if not record.at[0]:
             reason = f"cannot be loaded in a process of its own: {reason}"
         estimates = record.estimates(filter_.name, trial.run, filter_.error, reason=reason, guarded=filter_.guarded)
+    if estimates.failure is not None and filter_.file:
+        reason = estimates.failure.reason.replace(BY_VALUE, filter_.file)
+        estimates = replace(estimates, failure=replace(estimates.failure, reason=reason))
     if os.getpid() != own_pid:
         os._exit(1)  # a copy that the filter has made of its process
     for stream in (sys.stdout, sys.stderr):

@@ -246,8 +246,8 @@ def bias_of(sample: Sample, step: int | None, location: Location, faults: set[st
 def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found.
 
-    A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others; ``alone``, on
-    which the status depends, is of the pair farthest off in any case.
+    A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others. The status
+    depends on ``alone``, which is of the pair farthest off in any case.
     """
     if tests.matrix is None or sample.dof == 1:
         return None

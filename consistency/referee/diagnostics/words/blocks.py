@@ -37,18 +37,23 @@ def are_alike(intervals: list[Interval]) -> bool:
 
 
 def unlike_ratios(v: Findings) -> dict[str, Interval]:
-    """Blocks and axes whose ratio is not 1, the farthest first; none where all may be off by one factor."""
+    """Blocks and axes whose ratio is not 1, the farthest first; none where all may be off by one factor.
+
+    Of a conservative covariance those that are too large alone: nothing in it has to grow.
+    """
     if v.axes is None:
         return {}
     ratios = ratios_of_blocks(v.axes)
     if are_alike(list(ratios.values())):
         return {}
-    off = [(name, ratio) for name, ratio in ratios.items() if ratio.low > 1.0 or ratio.high < 1.0]
+    off = [(name, ratio) for name, ratio in ratios.items() if ratio.high < 1.0]
+    if v.status != "conservative":
+        off += [(name, ratio) for name, ratio in ratios.items() if ratio.low > 1.0]
     return dict(sorted(off, key=lambda item: -abs(np.log(max(item[1].value, TINY)))))
 
 
 def unlike_text(v: Findings) -> str:
-    """Position too small by x2.22 [1.80, 2.81], attitude right; '' where no factors are shown to differ."""
+    """Position too small by x2.22 [1.80, 2.81], attitude and velocity right; '' where factors may be the same."""
     off = unlike_ratios(v)
     if not off:
         return ""

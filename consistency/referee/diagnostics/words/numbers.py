@@ -78,6 +78,13 @@ def is_or_are(count: float) -> str:
     return "are"
 
 
+def with_subject(name: str, sentence: str) -> str:
+    """The sentence of a verdict on something of that name: "ekf is consistent: ...", or "ekf failed: ..."."""
+    if sentence.startswith("failed"):
+        return f"{name} {sentence}"
+    return f"{name} is {sentence}"
+
+
 def percent(share: float, digits: int = 2) -> str:
     """5.8 %, of a share."""
     if share < 0.995:

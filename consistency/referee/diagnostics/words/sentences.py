@@ -43,9 +43,10 @@ MOST_STEPS = 10_000_000  # of a log; more are not advice
 def reasons(v: Findings) -> list[str]:
     """First the sentence, then the figures."""
     sentence, figures = _sentence_and_figures(v)
-    lines = [*_failures(v), sentence, *figures]
+    failures = _failures(v)
+    lines = [*failures, sentence, *figures]
     if v.faults:
-        lines = [sentence, *_failures(v), *figures]
+        lines = ["; ".join([sentence, *failures]), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
     lines += [*details(v), *_first_steps(v)]
@@ -94,10 +95,14 @@ def _failures(v: Findings) -> list[str]:
     if v.failures:
         first = v.failures[0]
         count = len({failure.run for failure in v.failures})
+        runs = v.runs
         where = f"{v.unit} {first.run}"
-        if v.unit == "run":
-            where += f" in step {first.step}" if v.landmarks is not None else f" in {v.place(first.step)}"
-        lines.append(f"{count} of {v.runs} {v.unit}s failed, first {where}: {first.reason}")
+        if v.landmarks is not None:  # of a map, which failed runs do not have
+            runs += count
+            where += f" in step {first.step}"
+        elif v.unit == "run" and first.step > 1:  # without any estimate its step may be unknown
+            where += f" in {v.place(first.step)}"
+        lines.append(f"{count} of {runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
         count = len({run for run, _ in v.impossible})
@@ -216,6 +221,8 @@ def _no_fault(v: Findings, s: Scale) -> str:
     none = "no fault found"
     size = f"covariance ratio {_ratio_of_test(s)}"
     axis = ""
+    if v.status == "failed":
+        none = "no other fault found"
     if any(answer.tolerated for answer in v.answers):
         none = "no fault beyond the tolerance"
     if v.parts:

@@ -206,7 +206,7 @@ def _rest(plain: list[str]) -> tuple[int, ...]:
 
 def numbered(name: str) -> bool:
     """Whether a column has a number of a covariance, and not the names of two components."""
-    return NUMBERED.fullmatch(name.lower()) is not None
+    return any(pattern.fullmatch(name.lower()) for pattern in (NUMBERED, BY_INDEX))
 
 
 def _covariance(plain: list[str], rest: int) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import POSE
+from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.file_kinds import HEADINGS, PLACES
 from consistency.referee.readers.formats.named_columns import (
     DEVIATIONS,
@@ -64,6 +65,17 @@ def true_columns(sheet: TableRows, axes: Sequence[str]) -> TableRows | None:
     data = {axis: sheet.numbers(names[places[axis]]) for axis in axes}
     known: Array = ~np.isnan(np.column_stack(list(data.values()))).any(axis=1)
     return replace(sheet, data=data | {key: sheet.data[key] for key in KEYS if key in sheet}).rows(known)
+
+
+def require_true_columns(sheet: TableRows, axes: Sequence[str]) -> None:
+    """Refuse a table in which the truth of only some components stands beside the estimates."""
+    places = state_places(list(sheet.data), axes, TRUE)
+    missing = [axis for axis in axes if axis not in places]
+    if places and missing:
+        raise InputError(
+            f"{sheet.path}: column 'true_{missing[0]}' is missing; there are: {sheet.columns}; the state is "
+            f"{','.join(axes)}: --state names another, and --columns true_{missing[0]}=NAME that column"
+        )
 
 
 def state_places(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:

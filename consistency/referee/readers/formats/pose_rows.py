@@ -19,7 +19,14 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import Head, fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
-from consistency.referee.readers.formats.named_columns import Roles, naming, require_units, roles_of, true_roles_of
+from consistency.referee.readers.formats.named_columns import (
+    Roles,
+    clock_of,
+    naming,
+    require_units,
+    roles_of,
+    true_roles_of,
+)
 from consistency.referee.readers.formats.sheet import (
     Lines,
     TableRows,
@@ -68,7 +75,12 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
             )
         return _named(path, head, roles, true, columns)
     widths = [matrix + stated for matrix in MATRICES for stated in STATED]
-    lines = read_rows(path, (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES), LAYOUT)
+    unnamed = (*(POINT,) * true, *TUM, DEVIATED, *widths, *STATES)
+    if head is not None and not head.comment and len(head.names) not in unnamed:
+        missing = "t" if clock_of(head.names) is None else "x"
+        names = ", ".join(head.names)
+        raise InputError(f"{path}: column '{missing}' is missing; there are: {names}; {naming(missing)}")
+    lines = read_rows(path, unnamed, LAYOUT)
     width = lines.values.shape[1]
     if width == POINT:
         return increasing(replace(lines, note=f"{path}: read as positions without orientations, {width} columns"))
@@ -76,8 +88,8 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
         of = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
         return increasing(replace(lines, note=f"{path}: read as {of}, {width} columns"))
     if width in TUM:
-        unnamed = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
-        return increasing(replace(lines, note=unnamed if path.suffix.lower() == ".csv" else ""))
+        note = f"{path}: read as t x y z qx qy qz qw, as its columns have no names"
+        return increasing(replace(lines, note=note if path.suffix.lower() == ".csv" else ""))
     if width == ASL and not _is_rigid(lines.values[:, 1:]).all():
         return _asl(lines, true)
     if width in widths and (_is_rigid(_matrix(lines)[0]).all() or width not in STATES):

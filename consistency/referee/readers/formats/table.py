@@ -16,7 +16,12 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import naming
-from consistency.referee.readers.formats.other_names import true_columns, with_clock, with_known_names
+from consistency.referee.readers.formats.other_names import (
+    require_true_columns,
+    true_columns,
+    with_clock,
+    with_known_names,
+)
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.table_columns import (
     POSE,
@@ -150,6 +155,7 @@ def _require_truth(
         state = ""
         if not any(axis in sheet for axis in axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
+        require_true_columns(sheet, axes)
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")

@@ -346,7 +346,7 @@ def require_error(own: Lines, error: str | None) -> None:
     """Refuse covariances of states whose error is not declared, and an error of states for poses alone."""
     if _width(own) > 6 and error is None:
         what = f"{own.path}: holds a covariance of poses with their velocity, whose error is not known"
-        raise InputError(f"{what}; add --error {', '.join(INERTIAL)}")
+        raise InputError(f"{what}; add --error {', '.join(INERTIAL)} ('guess' is for poses alone)")
     if _width(own) == 6 and error not in (None, *SPATIAL):
         raise InputError(f"--error {error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
 
@@ -487,10 +487,11 @@ def _order_note(path: Path | str, n: int, r: Reading) -> list[str]:
     order = r.covariance_order
     blocks, there = blocks_in(n, order or ORDERS[0]), BLOCKS_OF_STATE[: n // 3]
     if sorted(blocks) != sorted(there):
-        has = (
-            f"the blocks {','.join(there)} of {path} (p position, R rotation, v velocity, bg, ba biases), as they stand"
+        blocks_of_file = f"the blocks {','.join(there)} of {path} in their order, such as {','.join(reversed(there))}"
+        raise InputError(
+            f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {blocks_of_file} "
+            "(p position, R rotation, v velocity, bg, ba biases)"
         )
-        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {has}")
     head = None if n == 6 or order else head_of(Path(path), r.columns)
     if order is None and (n == 6 or (head is not None and not any(map(numbered, head.names)))):
         return []

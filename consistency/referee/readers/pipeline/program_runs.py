@@ -321,7 +321,7 @@ def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
     for of_runs in kinds.values():
         first, why = min(of_runs.items())
         which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
-        said.append(f"{which}: {without_log(why)}; log {runs[first].log}")
+        said.append(f"{which}: {without_log(why)}; log {runs[first].log}, seed {runs[first].values['seed']}")
     return said
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from bench_trials import Case, twin_state
 
-from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians, move, process_noise
+from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians, pose_after, process_noise
 from consistency.bench.models import point, stereo
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Control
@@ -23,7 +23,7 @@ class Models:
 
     def f(self, x: Array, control: Control) -> Array:
         moved = x.copy()
-        moved[:3] = move(x[:3], control)
+        moved[:3] = pose_after(x[:3], control)
         return moved
 
     def noise(self, x: Array, control: Control, Q: Array) -> Array:

@@ -57,7 +57,7 @@ class Drive(_Quiet, TransitionModel):  # type: ignore[misc]
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> StateVectors:
         points = _points(state).copy()
-        points[:, :3] = basics.move(points[:, :3].T, self.control).T
+        points[:, :3] = basics.pose_after(points[:, :3].T, self.control).T
         return _vectors(points)
 
     def jacobian(self, state: Any, **kwargs: Any) -> Array:

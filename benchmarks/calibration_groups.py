@@ -233,7 +233,7 @@ def _clear(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
                 error, covariance, values = of.draw(rng, runs)
                 n, nees = error.shape[-1], ratio * _nees(error, covariance)
                 groups = groups_of(column_of("by", values), of.bins, np.isfinite(nees))
-                sample = Sample(nees, n, groups=groups)
+                sample = Sample(Record(world, nees=nees, dof=n, groups=groups), nees, n)
                 number = int(rng.integers(len(groups.names)))
                 one = sample.in_group(number)
                 if len(one.means):

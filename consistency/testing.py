@@ -17,7 +17,7 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
-from consistency.referee.gating.found import Look, deciding_runs, entry_of, marker_text
+from consistency.referee.gating.found import GateResult, entry_of, marker_text, runs_to_decide
 from consistency.referee.gating.watch import (
     Terms,
     current,
@@ -280,11 +280,11 @@ def _judged(
     """The verdict on one estimator, or what its gate raises."""
     __tracebackhide__ = True
 
-    def look(rate: float) -> Look:
+    def look(rate: float) -> GateResult:
         verdict = judge(record, _settings(rate, demand, subsets, method))
         sure = bool(record.failures) or verdict.status == "failed"
         bad = verdict.status not in ("consistent", "undecided")
-        return Look(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
+        return GateResult(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
         return gate_runs(
@@ -309,12 +309,12 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
             sides.usable_runs,
         )
 
-    def look(rate: float) -> Look:
+    def look(rate: float) -> GateResult:
         comparison = sides.compare(rate)
         worse = comparison.worse or sides.failed_more
         status = "worse" if worse else "not worse"
         reasons = sides.reasons(comparison)
-        return Look(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
+        return GateResult(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
 
     def needed(rate: float) -> int:
         return sides.compare(rate).needed_runs(demand.detect, demand.power)
@@ -328,8 +328,8 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
 
 
 def _settle(
-    gate: str, record: Record, demand: Terms, look: Callable[[float], Look], needed: Callable[[float], int]
-) -> Look:
+    gate: str, record: Record, demand: Terms, look: Callable[[float], GateResult], needed: Callable[[float], int]
+) -> GateResult:
     __tracebackhide__ = True
     result, late = look(demand.false_alarm), None
     runs, dof = len(record.run_numbers), planned_dof(record)
@@ -340,7 +340,7 @@ def _settle(
     few = not fault and (runs < least if result.verdict is None else result.status == "undecided")
     outcome = "fault found" if fault else "too few runs" if few else "passed"
     if few:  # ask for what is enough at the end of the session too, and for more than there are
-        least = max(needed(demand.false_alarm), deciding_runs(result, runs))
+        least = max(needed(demand.false_alarm), runs_to_decide(result, runs))
     current().keep(entry_of(gate, record, demand, result, late, outcome, least))
     if fault:
         verdict = result.verdict or judge(record, _settings(demand.false_alarm, demand))

@@ -6,7 +6,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.bench.runs.run_scores import run_means, wins
+from consistency.bench.runs.run_scores import mean_nees_of_runs, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b", "consistent-stereo")
 
@@ -41,7 +41,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     gain, low, high = removed(uvd_curves, ukf_curves, study.seed)
     return [
         study.finding(
-            run_means(xyz_curves).mean() > UPPER and xyz.status == "overconfident",
+            mean_nees_of_runs(xyz_curves).mean() > UPPER and xyz.status == "overconfident",
             scenario=SCENARIO,
             id="fig11b",
             source="Herath 2007, fig. 11b and sec. 4.5",
@@ -72,7 +72,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
             published="minimal improvement, inconsistent",
             measured=f"removes {100 * gain:.0f} % of the median run's excess (95 % bootstrap {100 * low:.0f} to "
             f"{100 * high:.0f}: {study.runs} runs leave it wide), lower in {wins(ukf_curves, uvd_curves)[0]} of "
-            f"{study.runs} runs; {said(ukf, ukf_curves)}; ekf-uvd's mean {run_means(uvd_curves).mean():.1f}",
+            f"{study.runs} runs; {said(ukf, ukf_curves)}; ekf-uvd's mean {mean_nees_of_runs(uvd_curves).mean():.1f}",
             accept=ACCEPT_13B,
         ),
         study.finding(
@@ -91,7 +91,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
 
 def removed(ekf: cs.Record, ukf: cs.Record, seed: int) -> tuple[float, float, float]:
     """Share of the median run's excess NEES that the UKF removes, with a 95 % bootstrap interval over paired runs."""
-    pairs = np.column_stack([run_means(ekf), run_means(ukf)])
+    pairs = np.column_stack([mean_nees_of_runs(ekf), mean_nees_of_runs(ukf)])
     drawn = np.random.default_rng(seed).integers(len(pairs), size=(2000, len(pairs)))
     medians = np.median(np.concatenate([pairs[None], pairs[drawn]]), axis=1) - 3.0
     gains = (medians[:, 0] - medians[:, 1]) / medians[:, 0]
@@ -101,7 +101,7 @@ def removed(ekf: cs.Record, ukf: cs.Record, seed: int) -> tuple[float, float, fl
 
 def said(verdict: cs.Verdict, curves: cs.Record) -> str:
     """Filter, verdict, and mean NEES over all, in the median and in the worst run, in words."""
-    runs, accuracy = run_means(curves), verdict.accuracy
+    runs, accuracy = mean_nees_of_runs(curves), verdict.accuracy
     assert accuracy is not None
     return (
         f"{verdict.filter} {verdict.status}, mean ANEES {runs.mean():.1f}, median run {np.median(runs):.1f}, "

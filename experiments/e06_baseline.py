@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}
@@ -31,7 +31,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     study.results(wide, ["ekf-xyz", "ekf-uvd"])
     judged = [study.judged(world, "ekf-xyz") for world in (narrow, between, wide)]
     verdicts = [verdict for verdict, _ in judged]
-    means = [float(run_means(curves).mean()) for _, curves in judged]
+    means = [float(mean_nees_of_runs(curves).mean()) for _, curves in judged]
     best = study.judged(wide, "ekf-uvd")[0]
     return [
         study.finding(

@@ -6,7 +6,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.bench.runs.findings import script
-from consistency.bench.runs.run_scores import run_means, wins
+from consistency.bench.runs.run_scores import mean_nees_of_runs, wins
 
 FINDINGS = ("long-range",)
 KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}
@@ -32,7 +32,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
     worse, p_value = wins(xyz_curves, uvd_curves)
     text = [f"ekf-uvd higher in {worse} of {study.runs} runs"]
     for verdict, curves in ((uvd, uvd_curves), (xyz, xyz_curves)):
-        runs, accuracy = run_means(curves), verdict.accuracy
+        runs, accuracy = mean_nees_of_runs(curves), verdict.accuracy
         assert accuracy is not None
         text.append(
             f"{verdict.filter} {verdict.status}, mean ANEES {runs.mean():.0f}, median run {np.median(runs):.0f}, "

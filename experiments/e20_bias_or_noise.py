@@ -14,7 +14,7 @@ from scipy.stats import bootstrap
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.referee.types import Array
 
@@ -87,7 +87,7 @@ def variants(k: float) -> dict[str, cs.Scenario]:
 
 def share(study: cs.Study, worlds: dict[str, cs.Scenario]) -> cs.Finding:
     found = {name: study.judged(world, "ekf-uvd") for name, world in worlds.items()}
-    means = {name: run_means(curves) for name, (_, curves) in found.items()}
+    means = {name: mean_nees_of_runs(curves) for name, (_, curves) in found.items()}
     status = {name: verdict.status for name, (verdict, _) in found.items()}
     shares = {name: interval_of_share(means["as noise"], means[name], study.seed) for name in ("mapped", "known")}
     _, low, _ = shares["mapped"]

@@ -20,7 +20,7 @@ from scipy.stats import ttest_rel
 
 import consistency as cs
 from consistency.bench.runs.findings import OURS, script
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
@@ -147,7 +147,7 @@ def verdicts(study: cs.Study, worlds: dict[tuple[str, str], cs.Scenario]) -> pd.
     for (model, belief), world in each(worlds.items(), len(worlds), "beliefs", "worlds"):
         for name in FILTERS:
             found = cs.analyse(study.results(world, [name]), [name], confidence=1.0 - LEVEL)[name]
-            log_nees = np.log(run_means(study.judged(world, name)[1]))
+            log_nees = np.log(mean_nees_of_runs(study.judged(world, name)[1]))
             before = logs.setdefault((model, name), log_nees)  # of noise and map, which comes first
             test = ttest_rel(log_nees, before, alternative="greater", nan_policy="omit")
             p = np.nan if belief == BELIEFS[0] else float(test.pvalue)

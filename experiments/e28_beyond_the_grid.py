@@ -16,7 +16,7 @@ from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.findings import script
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.run_scores import log_rmse, run_means
+from consistency.bench.runs.run_scores import log_rmse, mean_nees_of_runs
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 
@@ -182,7 +182,7 @@ def row(verdict: cs.Verdict, record: cs.Record, beside: Array, cost: float) -> t
     """Numbers of one filter; ``beside`` (runs,) are log RMSE of another, ``cost`` is in ms a step."""
     assert record.nees is not None
     steps = record.nees.shape[1]
-    nees = np.stack([run_means(record), record.nees[:, -(steps // 10) :].mean(axis=1)]) / 3.0
+    nees = np.stack([mean_nees_of_runs(record), record.nees[:, -(steps // 10) :].mean(axis=1)]) / 3.0
     value, low, high = mean_of(nees[0], SURELY)
     rmse, rmse_low, rmse_high = np.exp(mean_of(log_rmse(record, (0, 1)) - beside))
     numbers = {

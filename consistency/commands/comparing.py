@@ -54,7 +54,7 @@ def compare_command(
 ) -> None:
     """Compare a filter with another, or with an earlier version. On the same trials, the comparison is run by run."""
     from consistency.referee.verdicts.baselines import is_baseline
-    from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, document
+    from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, comparison_document
     from consistency.referee.verdicts.sources import skip_asked
 
     require_word("--fail-on", fail_on, "worse")
@@ -76,7 +76,7 @@ def compare_command(
     else:
         compared = compare_filters(new, filters or [], false_alarm)
     tell_notes(*read.values())
-    print_document(document(compared), as_json)
+    print_document(comparison_document(compared), as_json)
     if fail_on and any(each.worse for each in compared):
         raise typer.Exit(1)
 

@@ -220,7 +220,7 @@ class TrueKalman:
     def predict(self, state, control):
         before, x, P = self.path[state.step], state.slam.x.copy(), state.slam.P.copy()
         F, G = basics.motion_jacobians(before, control)
-        x[:3] = basics.move(before, control) + F @ (x[:3] - before)
+        x[:3] = basics.pose_after(before, control) + F @ (x[:3] - before)
         P[:3] = F @ P[:3]
         P[:, :3] = P[:, :3] @ F.T
         P[:3, :3] += basics.process_noise(G, state.slam.problem.belief)

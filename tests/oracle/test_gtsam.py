@@ -193,7 +193,7 @@ class LinearWorld:
     def moved(self, pose, control):
         step = len(self.reference)
         at = self.reference.setdefault(0, self.problem.start) if step == 0 else self.reference[step - 1]
-        self.reference[max(step, 1)] = basics.move(at, control)
+        self.reference[max(step, 1)] = basics.pose_after(at, control)
         F, _ = basics.motion_jacobians(at, control)
         return self.reference[max(step, 1)] + F @ (pose - at)
 

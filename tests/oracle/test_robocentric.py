@@ -49,15 +49,15 @@ def sensor(small, tilted):
 @pytest.mark.parametrize("i", range(len(Y)))
 def test_carrying_a_landmark_has_the_derivatives_it_says(sensor, i):
     R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
-    _, J, _, _ = inverse_range.carried(Y, R, t, sensor)
-    assert close(J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
-    assert not close(1.001 * J[i], along(lambda y: inverse_range.carried(y[None], R, t, sensor)[0][0], Y[i]))
+    _, J, _, _ = inverse_range.in_new_frame(Y, R, t, sensor)
+    assert close(J[i], along(lambda y: inverse_range.in_new_frame(y[None], R, t, sensor)[0][0], Y[i]))
+    assert not close(1.001 * J[i], along(lambda y: inverse_range.in_new_frame(y[None], R, t, sensor)[0][0], Y[i]))
 
 
 def test_carrying_there_and_back_changes_nothing(sensor):
     R, t = heading_matrix(-0.3), np.array([-0.4, 0.2, 0.0])
-    there = inverse_range.carried(Y, R, t, sensor)[0]
-    assert close(inverse_range.carried(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
+    there = inverse_range.in_new_frame(Y, R, t, sensor)[0]
+    assert close(inverse_range.in_new_frame(there, R.T, -R.T @ t, sensor)[0], Y, 1e-12)
 
 
 DRIVE, TURN = 0.4, 0.3  # m, rad
@@ -68,7 +68,7 @@ def bends(sensor, i):
 
     def there(drive, about):
         R = heading_matrix(-TURN - about)
-        return inverse_range.carried(Y, R, -R[:, 0] * (DRIVE + drive), sensor)[0][i]
+        return inverse_range.in_new_frame(Y, R, -R[:, 0] * (DRIVE + drive), sensor)[0][i]
 
     step, here = 1e-3, there(0.0, 0.0)
     ends = [(there(*(step * d)), there(*(-step * d))) for d in np.eye(2)]
@@ -101,8 +101,8 @@ def test_the_noise_of_a_motion_spreads_landmarks_to_second_order(small, tilted, 
 def test_the_noise_of_a_motion_moves_the_mean_by_half_of_its_second_derivatives(sensor, i):
     sigmas, exact = (0.05, 0.2), bends(sensor, i)[1] * np.square((0.05, 0.2))
     R = heading_matrix(-TURN)
-    _, _, D, b = inverse_range.carried(Y, R, -R[:, 0] * DRIVE, sensor)
-    said = inverse_range.curvature(b, Y[:, 2], D, R[:, 0], sigmas, sensor)[i]
+    _, _, D, b = inverse_range.in_new_frame(Y, R, -R[:, 0] * DRIVE, sensor)
+    said = inverse_range.mean_shift(b, Y[:, 2], D, R[:, 0], sigmas, sensor)[i]
     assert close(said, exact, 1e-8)
     assert np.abs(exact).max(axis=0).min() > 1e-5
     frame, mount = Frame(0.0, 0.0, R[0, 0], R[1, 0]), sensor.mount.packed()
@@ -135,7 +135,7 @@ def test_the_left_jacobian_is_that_of_exp_up_to_the_third_order():
         left = along(
             lambda error, xi=xi: inverse_range.moved_pose(inverse_range.moved_pose(pose, xi), error), np.zeros(3)
         )
-        gaps.append(np.abs(ahead - left @ inverse_range.left_jacobian(xi)).max())
+        gaps.append(np.abs(ahead - left @ inverse_range.pose_jacobian(xi)).max())
     assert gaps[0] < 1e-3
     assert gaps[1] < gaps[0] / 6.0
     assert close(
@@ -178,9 +178,9 @@ def test_a_disparity_freed_of_its_range_has_the_expected_mean_and_the_variance_i
     low, high, sigma = 1.0, 32.0, 0.65
     inside = truncnorm((low - expected) / sigma, (high - expected) / sigma, loc=expected, scale=sigma)
     d = np.array([inside.mean()])
-    mean, variance = inverse_range.untruncated(d, np.array([expected]), sigma, (low, high))
+    mean, variance = inverse_range.untruncated_disparity(d, np.array([expected]), sigma, (low, high))
     assert mean[0] == pytest.approx(expected)
-    slope = inverse_range.untruncated(d + 1.0, np.array([expected]), sigma, (low, high))[0] - mean
+    slope = inverse_range.untruncated_disparity(d + 1.0, np.array([expected]), sigma, (low, high))[0] - mean
     assert variance[0] == pytest.approx(slope[0] ** 2 * inside.var())
 
 

@@ -23,7 +23,7 @@ from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
 from consistency.referee.document.blocks import Reasons
 from consistency.referee.document.judged_filters import reason
-from consistency.referee.show.text import fragment
+from consistency.referee.document.wording import fragment
 from consistency.referee.types import Failure
 
 SURE = 1e-5

@@ -21,7 +21,7 @@ def log_rmse(of: Record, axes: Sequence[int]) -> Array:
     return value
 
 
-def run_means(of: Record) -> Array:
+def mean_nees_of_runs(of: Record) -> Array:
     """Mean NEES of each run over its judged steps, in the filter's own error, shape (R,); infinite for a failed run."""
     assert of.nees is not None
     means, count = scale.run_means(of.nees)
@@ -46,5 +46,5 @@ def _ratio(nis: Array, nis_dof: Array) -> Array:
 
 def wins(a: Record, b: Record) -> tuple[int, float]:
     """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test without ties."""
-    better, worse = (int((run_means(x) < run_means(y)).sum()) for x, y in ((a, b), (b, a)))
+    better, worse = (int((mean_nees_of_runs(x) < mean_nees_of_runs(y)).sum()) for x, y in ((a, b), (b, a)))
     return better, float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0

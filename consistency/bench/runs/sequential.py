@@ -14,7 +14,7 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.campaign import Campaign
 from consistency.bench.runs.montecarlo import run_trials, studied, workers_for
 from consistency.bench.runs.results_to_records import record_of, records_of
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables, open_results
@@ -148,7 +148,7 @@ def _pilot_means(of: Record) -> Array:
     """Mean NEES over dof of the runs that did not fail, (runs,)."""
     if of.nees is None:
         raise InputError(f"{of.name}: has no truth; only runs with a NEES tell how their steps depend on each other")
-    means = run_means(of)
+    means = mean_nees_of_runs(of)
     means = means[np.isfinite(means)] / len(POSE)
     if len(means) < FEW:
         raise InputError(f"{of.name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")

@@ -19,7 +19,7 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import simulate
@@ -136,7 +136,7 @@ def runs_table(record: Record) -> pd.DataFrame:
     steps = [failed[run].step if run in failed else None for run in runs]
     reasons = [failed[run].reason if run in failed else None for run in runs]
     position, heading = np.sqrt(mean[:, 0] + mean[:, 1]), np.sqrt(mean[:, 2])
-    columns = (runs, run_means(record), position, heading, pd.array(steps, "Int64"), reasons)
+    columns = (runs, mean_nees_of_runs(record), position, heading, pd.array(steps, "Int64"), reasons)
     return pd.DataFrame(dict(zip(RUN_COLUMNS, columns, strict=True)))
 
 

@@ -108,7 +108,8 @@ def summary(
     squared = covered = np.empty((len(nees), 0))
     if error is not None and covariance is not None:
         both = by_runs(_squared_and_covered, np.asarray(nees), np.asarray(error), np.asarray(covariance))
-        squared, covered = both[:, 0], both[:, 1]
+        squared = both[:, 0]
+        covered = both[:, 1]
     if runs is None:
         runs = np.arange(len(nees))
     return RunSummary(runs, dof, means / dof, squared, covered)
@@ -170,9 +171,11 @@ def compare(
     which = ""
     if paired:
         which = " in common"
-        a, b = _rows(a, np.isin(a.runs, common)), _rows(b, np.isin(b.runs, common))
+        a = _rows(a, np.isin(a.runs, common))
+        b = _rows(b, np.isin(b.runs, common))
     else:
-        a, b = _rows(a, np.isfinite(a.nees)), _rows(b, np.isfinite(b.nees))
+        a = _rows(a, np.isfinite(a.nees))
+        b = _rows(b, np.isfinite(b.nees))
     fewest = min(len(a.runs), len(b.runs))
     if fewest < FEWEST:
         raise ValueError(f"a comparison needs at least {FEWEST} runs{which}, got {fewest}")
@@ -190,7 +193,8 @@ def compare(
             raise ValueError(f"every NEES of {side} is 0; a filter without errors cannot be compared")
     gap, total = (contrast(a.nees, b.nees, sign, paired) for sign in (-1.0, 1.0))
     above, below = (max(p) for p in zip(gap.p_values, total.p_values, strict=True))
-    log_a, log_b = 0.5 * (total.value + gap.value), 0.5 * (total.value - gap.value)
+    log_a = 0.5 * (total.value + gap.value)
+    log_b = 0.5 * (total.value - gap.value)
     tail = 0.5 * false_alarm
     width = 0.5 * (total.half_width(tail) + gap.half_width(tail))  # of log_b, at most
     return Comparison(
@@ -227,15 +231,18 @@ def _planned(error: float, runs: int, size: float, false_alarm: float, power: fl
         quantiles = special.stdtrit(count - 1.0, [0.5 * false_alarm, 0.5 * (1.0 - power)])
         return bool(-quantiles.sum() * error * np.sqrt(runs / count) * np.exp(margin(count - 1.0)) <= size)
 
-    low, high = FEWEST - 1, FEWEST
+    low = FEWEST - 1
+    high = FEWEST
     while not enough(high) and high < MOST:
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
     return low + 1 + bisect_left(range(low + 1, high), True, key=enough)
 
 
 def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence: float) -> Difference:
     """(mean a / mean b) ** power; power 1/2 makes an RMSE of squares."""
-    mean_a, mean_b = float(a.mean()), float(b.mean())
+    mean_a = float(a.mean())
+    mean_b = float(b.mean())
     if not (mean_a > 0 and mean_b > 0):
         return Difference(name, mean_a**power, mean_b**power, float("nan"), float("nan"), float("nan"))
     error, freedom = _error(power * a / mean_a, power * b / mean_b, paired)
@@ -247,7 +254,8 @@ def _ratio(name: str, a: Array, b: Array, power: float, paired: bool, confidence
 
 def _share(name: str, a: Array, b: Array, paired: bool, confidence: float) -> Difference:
     error, freedom = _error(a, b, paired)
-    gap, half = float(a.mean() - b.mean()), _half(error, freedom, confidence)
+    gap = float(a.mean() - b.mean())
+    half = _half(error, freedom, confidence)
     missing = 1.0 - (0.5 * (1.0 - confidence)) ** (1.0 / min(len(a), len(b)))  # a share of runs that may not be drawn
     half = max(half, missing * (max(np.ptp(a), np.ptp(b)) or 1.0))  # and may differ as much as those that are
     return Difference(name, float(a.mean()), float(b.mean()), gap, max(gap - half, -1.0), min(gap + half, 1.0))
@@ -257,7 +265,8 @@ def _error(a: Array, b: Array, paired: bool) -> tuple[float, float]:
     """Standard error of mean a minus mean b, and its degrees of freedom."""
     if paired:
         return float((a - b).std(ddof=1) / np.sqrt(len(a))), float(len(a) - 1)
-    of_a, of_b = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
+    of_a = a.var(ddof=1) / len(a)
+    of_b = b.var(ddof=1) / len(b)
     if of_a + of_b == 0:
         return 0.0, 1.0
     freedom = (of_a + of_b) ** 2 / (of_a**2 / (len(a) - 1) + of_b**2 / (len(b) - 1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.judging.status import deciding_axis
@@ -14,15 +14,13 @@ from consistency.referee.diagnostics.questions.scale import ratio_interval, run_
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import e_process, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
-from consistency.referee.diagnostics.verdict.parts import RejectionScore, Scale
+from consistency.referee.diagnostics.verdict.parts import RejectionScore
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
 from consistency.referee.diagnostics.words.sentences import (
-    LATER,
     details,
     other_ways,
     reasons,
     sentences_of_conventions,
-    unshown_sentence,
 )
 
 if TYPE_CHECKING:
@@ -66,80 +64,67 @@ def judge(
     ValueError
         Nothing to judge is given, or shapes or options do not fit.
     """
+    kept = None
+    if keep_record:
+        kept = record
     if design is not None:
-        return follow(design, record.first_runs, len(record.run_numbers))[0]
+        return follow(design, record.first_runs, len(record.run_numbers), kept)[0]
     if record.guesses:
-        return _judge_conventions(record, settings, keep_record)
-    evidence, truth, unshown = record.as_runs, None, record.unshown
+        return _judge_conventions(record, settings, kept)
+    evidence = record.as_runs
+    truth = None
+    unshown = record.unshown
     if record.truth_covariance is not None:
         from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import uncertain_truth
 
         truth = uncertain_truth(record)
     if truth is not None:
-        evidence, unshown = truth.evidence, record.unshown or truth.unjudged
-    if unshown:
-        evidence = replace(evidence, unavailable=tuple(SHARES))
+        evidence = truth.evidence
+        unshown = record.unshown or truth.unjudged
     if evidence.parts:
         from consistency.referee.diagnostics.judging.separate_components import findings_of_parts
 
-        found = findings_of_parts(evidence, settings, verdict_of)
+        found = findings_of_parts(evidence, settings, unshown)
     else:
-        found = findings_of(evidence, settings, truth=truth)
-    first = ""
-    if unshown and found.scale is not None and found.status != "failed":
-        found = replace(found, status="undecided", scale=_not_shown(found.scale))
-        first = unshown_sentence(found, unshown)
+        found = findings_of(evidence, settings, truth=truth, unshown=unshown)
     world = None
     if record.world is not None:
-        world = verdict_of(findings_of(record.in_world, settings))
-    beside = Beside(world, _map_of(record, settings), _rejections_of(record, None), record if keep_record else None)
-    return _whole(record, found, first, beside)
-
-
-class Beside(NamedTuple):
-    """What a verdict says beside the errors and innovations."""
-
-    world: Verdict | None
-    map: MapScore | None
-    rejection: RejectionScore | None
-    record: Record | None = None
-
-
-def verdict_of(found: Findings, first: str = "") -> Verdict:
-    """The verdict on errors and innovations alone; ``first`` stands in the place of the first sentence."""
-    return Verdict(
-        **vars(found), reasons=tuple(reasons(found, first)), details=tuple(details(found)), axis=deciding_axis(found)
+        in_world = findings_of(record.in_world, settings)
+        world = _verdict(in_world, reasons(in_world))
+    return _whole(
+        record, found, world=world, map=_map_of(record, settings), rejection=_rejections_of(record), record=kept
     )
 
 
-def _not_shown(scale: Scale) -> Scale:
-    """The scale of which nothing can be shown."""
-    return replace(scale, equivalence=replace(scale.equivalence, p_value=float("nan"), runs=None))
+def _verdict(found: Findings, sentences: Sequence[str], **beside: Any) -> Verdict:
+    """The findings with the ``sentences`` that say them, and what stands ``beside`` them."""
+    fields = vars(found) | {"parts": {name: _verdict(part, reasons(part)) for name, part in found.parts.items()}}
+    fields |= {"reasons": tuple(sentences), "details": tuple(details(found)), "axis": deciding_axis(found)}
+    return Verdict(**fields | beside)
 
 
-def _whole(record: Record, found: Findings, first: str, beside: Beside) -> Verdict:
-    """The whole verdict: the findings in words, and what the record says beside its arrays."""
-    sentence, *figures = reasons(found, first)
-    if record.caption:
-        sentence = f"{sentence}; {record.caption}"
+def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
+    """The verdict on a record: its findings in words, and what stands beside its errors and innovations."""
+    sentence, *figures = reasons(found)
+    if judged.caption:
+        sentence = f"{sentence}; {judged.caption}"
     convention = align = None
-    if record.convention:
-        convention, align = record.convention, record.align or None
+    if judged.convention:
+        convention = judged.convention
+        align = judged.align or None
     left_out = set(found.left_out_steps)
-    if record.align:
-        left_out.update(record.left_out_steps)
-    causes = (*record.causes, *_causes_of_innovations(record, found))
-    fields = vars(found) | {"left_out_steps": tuple(sorted(left_out))}
-    return Verdict(
-        **fields,
-        reasons=(sentence, *figures, *causes, *other_ways(found.status, record)),
-        details=tuple(details(found)),
-        axis=deciding_axis(found),
+    if judged.align:
+        left_out.update(judged.left_out_steps)
+    causes = (*judged.causes, *_causes_of_innovations(judged, found))
+    return _verdict(
+        found,
+        [sentence, *figures, *causes, *other_ways(found.status, judged)],
+        left_out_steps=tuple(sorted(left_out)),
         convention=convention,
         align=align,
-        notes=tuple(record.notes),
+        notes=tuple(judged.notes),
         causes=causes,
-        **beside._asdict(),
+        **beside,
     )
 
 
@@ -149,7 +134,8 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
         return []
     from consistency.referee.diagnostics.questions.innovations import innovation_causes, nis_and_dof
 
-    innovations, nees_ratio = nis_and_dof(record), float("nan")
+    innovations = nis_and_dof(record)
+    nees_ratio = float("nan")
     if innovations is None:
         return []
     if found.scale is not None:
@@ -157,7 +143,7 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
     return innovation_causes(*innovations, nees_ratio)
 
 
-def _map_of(record: Record, settings: Settings | None) -> MapScore | None:
+def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None:
     """Score of the maps, which are read for it, with the verdict on them; without settings the score alone."""
     if record.map is None:
         return None
@@ -169,13 +155,15 @@ def _map_of(record: Record, settings: Settings | None) -> MapScore | None:
     if settings is None:
         landmarks = landmarks.of_runs(_end_of_runs(record))
         return map_score(landmarks.run, landmarks.nees, landmarks.dof)
-    verdict, of_map = None, landmarks.record(last_nees(record))
+    verdict = None
+    of_map = landmarks.record(last_nees(record))
     if of_map is not None:
-        verdict = verdict_of(findings_of(of_map, settings))
+        found = findings_of(of_map, settings)
+        verdict = _verdict(found, reasons(found))
     return map_score(landmarks.run, landmarks.nees, landmarks.dof, verdict)
 
 
-def _rejections_of(record: Record, runs: int | None) -> RejectionScore | None:
+def _rejections_of(record: Record, runs: int | None = None) -> RejectionScore | None:
     """What a guard rejected in the first runs, or in all."""
     if record.rejections is None:
         return None
@@ -193,7 +181,7 @@ def _end_of_runs(record: Record) -> int:
 # --- errors whose convention nobody declared ---------------------------------------------------------
 
 
-def _judge_conventions(record: Record, settings: Settings, keep_record: bool) -> Verdict:
+def _judge_conventions(record: Record, settings: Settings, kept: Record | None) -> Verdict:
     """Undecided, with every convention that is not rejected at ``settings.false_alarm``, and its ratio.
 
     The right convention is rejected with that probability at most, whichever it is. The intervals of the ratio hold
@@ -205,29 +193,26 @@ def _judge_conventions(record: Record, settings: Settings, keep_record: bool) ->
     """
     verdicts = {kind: judge(one, settings) for kind, one in record.guesses.items()}
     confidence = 1.0 - settings.false_alarm / len(verdicts)
-    found = {}
+    results = {}
     for kind, verdict in verdicts.items():
         runs = record.guesses[kind].as_runs
         assert runs.nees is not None
         means, counts = run_means(runs.nees)
         ratio = ratio_interval(means[counts > 0] / runs.dof, runs.dof, confidence)
         possible = not verdict.faults and verdict.status != "failed"
-        found[kind] = ConventionResult(verdict.status, verdict.faults, ratio, possible)
+        results[kind] = ConventionResult(verdict.status, verdict.faults, ratio, possible)
     first = next(iter(verdicts.values()))
-    scale = first.scale
-    if scale is not None:
-        scale = _not_shown(scale)
-    return replace(
-        first,
-        status="undecided",
-        scale=scale,
-        answers=(),
-        guesses=found,
-        convention=None,
-        notes=tuple(record.notes),
-        reasons=tuple(sentences_of_conventions(found, verdicts, settings)),
-        record=record if keep_record else None,
-    )
+    of_first = vars(first) | {
+        "status": "undecided",
+        "scale": first.scale and first.scale.not_shown,
+        "answers": (),
+        "guesses": results,
+        "convention": None,
+        "notes": tuple(record.notes),
+        "reasons": tuple(sentences_of_conventions(results, verdicts, settings)),
+        "record": kept,
+    }
+    return Verdict(**of_first)
 
 
 # --- looks at growing numbers of runs ------------------------------------------------------------------
@@ -238,8 +223,7 @@ def look(design: Design, evidence: Record, spent: float | None) -> Verdict:
 
     A filter without truth is judged by its innovations, at looks only.
     """
-    found, first = _inspected(design, evidence, spent)
-    return _of_look(design, evidence, _end_of_runs(evidence), found, first)
+    return _of_look(design, evidence, _end_of_runs(evidence), _inspected(design, evidence, spent))
 
 
 def speaks(design: Design, evidence: Record, spent: float | None) -> bool:
@@ -247,21 +231,24 @@ def speaks(design: Design, evidence: Record, spent: float | None) -> bool:
     return spent is not None or _p_of_scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
 
 
-def follow(design: Design, evidence_of: Callable[[int], Record], limit: int | None = None) -> tuple[Verdict, int]:
+def follow(
+    design: Design, evidence_of: Callable[[int], Record], limit: int | None = None, kept: Record | None = None
+) -> tuple[Verdict, int]:
     """Inspect runs until decided; return the verdict and the number of runs used.
 
     Parameters
     ----------
     evidence_of : function that returns the first k runs of a filter
     limit : number of available runs; the last inspection within it decides, or all runs if they are fewer than 12
+    kept : record of all runs, kept with the verdict to be drawn
     """
     for runs, spent, is_last in _inspections(design, limit):
         evidence = evidence_of(runs)
         if not is_last and not speaks(design, evidence, spent):
             continue
-        found, first = _inspected(design, evidence, spent)
+        found = _inspected(design, evidence, spent)
         if is_last or found.status != "undecided":
-            return _of_look(design, evidence, runs, found, first), runs
+            return _of_look(design, evidence, runs, found, kept), runs
     raise AssertionError("unreachable: a design without a last look is endless")
 
 
@@ -277,20 +264,18 @@ def looks(
     """
     for runs, spent in design.inspections():
         yield runs
-        for name in [name for name in filters if name not in decided]:
-            verdict = _look_at(design, read(runs, name), runs, spent)
-            if verdict is not None and (verdict.status != "undecided" or runs == design.max_runs):
+        is_last = runs == design.max_runs
+        for name in filters:
+            if name in decided:
+                continue
+            evidence = read(runs, name).first_runs(runs)
+            if not is_last and not speaks(design, evidence, spent):
+                continue
+            verdict = look(design, evidence, spent)
+            if is_last or verdict.status != "undecided":
                 decided[name] = verdict
         if len(decided) == len(filters):
             return
-
-
-def _look_at(design: Design, record: Record, runs: int, spent: float | None) -> Verdict | None:
-    """What is said after so many runs; None where it is not the time to ask."""
-    some = record.first_runs(runs)
-    if runs != design.max_runs and not speaks(design, some, spent):
-        return None
-    return look(design, some, spent)
 
 
 def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float | None, bool]]:
@@ -306,22 +291,20 @@ def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float
         yield runs, spent, (runs, spent) == within[-1]
 
 
-def _inspected(design: Design, evidence: Record, spent: float | None) -> tuple[Findings, str]:
-    """Findings of an inspection, and the sentence of one that cannot decide; '' of any other."""
-    inspection = Inspection(spent, _p_of_scale(design, evidence))
-    found = findings_of(evidence, design.settings, inspection)
-    if spent is None and found.consistent:
-        return replace(found, status="undecided"), LATER
-    return found, ""
+def _inspected(design: Design, evidence: Record, spent: float | None) -> Findings:
+    """Findings of an inspection."""
+    return findings_of(evidence, design.settings, Inspection(spent, _p_of_scale(design, evidence)))
 
 
-def _of_look(design: Design, record: Record, runs: int, found: Findings, first: str) -> Verdict:
+def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept: Record | None = None) -> Verdict:
     """The verdict of a look at the first ``runs``, with what is known beside them."""
     world = None
-    if record.world is not None:
-        errors = replace(record.in_world, map=None, rejections=None, caption="", causes=(), notes=(), convention="")
+    if evidence.world is not None:
+        errors = replace(evidence.in_world, map=None, rejections=None, caption="", causes=(), notes=(), convention="")
         world, _ = follow(design, errors.first_runs, runs)
-    return _whole(record, found, first, Beside(world, _map_of(record, None), _rejections_of(record, runs)))
+    return _whole(
+        evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs), record=kept
+    )
 
 
 def _p_of_scale(design: Design, evidence: Record) -> float:

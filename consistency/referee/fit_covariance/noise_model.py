@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
+from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
@@ -43,7 +44,6 @@ from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise
 from consistency.referee.geometry.groups import log, matrices
 from consistency.referee.readers.pipeline.relative_motions import Stretch
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import judge_all
 
 SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at
 FEWEST = 3  # windows at a span that is shown
@@ -217,7 +217,7 @@ def fit_covariance(
         per_rad=variances[n:],
         spans=spans,
         record=record,
-        verdict=replace(judge_all([record])[record.name], record=record),
+        verdict=judge(record, keep_record=True),
         fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
         judged_drives=tuple(drives[i].name for i in judged),
         held_out=HALF if by_halves else held_out or IN_TURN,

@@ -38,27 +38,37 @@ class Sides:
     @property
     def usable_runs(self) -> int:
         """Runs that both have, or the fewer of the two where they are not paired."""
-        a, b = (x.runs[np.isfinite(x.nees)] for x in (self.a, self.b))
-        return len(np.intersect1d(a, b)) if self.paired else min(len(a), len(b))
+        a = self.a.runs[np.isfinite(self.a.nees)]
+        b = self.b.runs[np.isfinite(self.b.nees)]
+        if self.paired:
+            return len(np.intersect1d(a, b))
+        return min(len(a), len(b))
 
     def compare(self, false_alarm: float) -> Comparison:
         return compare(self.a, self.b, false_alarm, self.axes, self.paired)
 
     def reasons(self, c: Comparison) -> list[str]:
-        anees = c.differences[0]
-        outcome = "worse" if c.worse or self.failed_more else "not worse"
+        """The outcome in a sentence, then every difference."""
+        anees, outcome, where, runs = c.differences[0], "not worse", "nearer to", "runs"
+        if c.worse or self.failed_more:
+            outcome = "worse"
+        if c.distance > 0:
+            where = "farther from"
+        if c.paired:
+            runs = "paired runs"
         lines = [
             f"{outcome} than {self.name_b}: mean NEES {anees.a:.3g} against {anees.b:.3g}, {self.a.dof} expected; "
-            f"its ratio to {self.a.dof} is {'farther from' if c.distance > 0 else 'nearer to'} 1 "
-            f"by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, {c.runs} {'paired runs' if c.paired else 'runs'})"
+            f"its ratio to {self.a.dof} is {where} 1 by x{np.exp(abs(c.distance)):.3g} (p {c.p_value:.2g}, "
+            f"{c.runs} {runs})"
         ]
         if self.failed_more:
             lines.append(f"{self.failures.a} runs failed, of {self.name_b} {self.failures.b}")
-        lines += [
-            f"{d.name} {d.a:.4g} against {d.b:.4g}: {'difference' if 'coverage' in d.name else 'ratio'} "
-            f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
-            for d in c.differences
-        ]
+        for d in c.differences:
+            kind = "ratio"
+            if "coverage" in d.name:
+                kind = "difference"
+            interval = f"{d.difference:.3g} [{d.low:.3g}, {d.high:.3g}]"
+            lines.append(f"{d.name} {d.a:.4g} against {d.b:.4g}: {kind} {interval}")
         return lines
 
 
@@ -72,7 +82,8 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
     """
     a, row_a = _side("candidate a", name, candidate)
     b, row_b = _side("reference b", name, reference)
-    m, n = len(a.run_numbers), len(b.run_numbers)
+    m = len(a.run_numbers)
+    n = len(b.run_numbers)
     if m != n:
         raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
     if a.dof != b.dof:
@@ -111,12 +122,16 @@ def of_filters(
         raise ValueError("than: name the filter to compare with, or give other results as reference")
     candidate = record_of_filter(results, filter_name, name, skip=skip)
     new = baseline(results, skip=skip)
-    old = new if reference is None else require_skip(reference, skip)
+    old = new
+    if reference is not None:
+        old = require_skip(reference, skip)
     of_a = filter_name or results.filters[0]
     of_b = than or of_a
     if of_b not in old.filters:
         raise ValueError(f"filter '{of_b}' is not in the reference; there are: {', '.join(old.filters)}")
     paired = new.of_the_trials_of(old)
-    label = of_b if old is new else f"{of_b} in {old.name}"
+    label = of_b
+    if old is not new:
+        label = f"{of_b} in {old.name}"
     failures = FailedRuns(new.failures[of_a], old.failures[of_b])
     return Sides(candidate, new.filters[of_a], old.filters[of_b], label, tuple(POSE), paired, failures)

@@ -39,10 +39,13 @@ def record_of_checked(
     """One estimator with checked arrays; arguments and errors as :func:`consistency.testing.assert_consistent`."""
     if covariances is not None and deviations is not None:
         raise ValueError("give covariances or deviations, not both")
-    key, size = ("covariances", covariances) if deviations is None else ("deviations", deviations)
-    if (errors is None) != (size is None):
-        there, missing = (key, "errors") if errors is None else ("errors", "covariances")
-        raise ValueError(f"{there} without {missing}: give both")
+    key, size = "covariances", covariances
+    if deviations is not None:
+        key, size = "deviations", deviations
+    if errors is None and size is not None:
+        raise ValueError(f"{key} without errors: give both")
+    if errors is not None and size is None:
+        raise ValueError("errors without covariances: give both")
     if errors is not None and nees is not None:
         raise ValueError("give errors and covariances, or nees and dof, not both")
     if nees is not None and dof is None:
@@ -52,10 +55,13 @@ def record_of_checked(
             raise ValueError(f"{option} needs errors and covariances: the nees does not know its components")
     if subsets is not None and deviations is not None:
         raise ValueError("subsets needs covariances: of deviations each component is judged by itself")
-    record, given = Record(name), {"errors": errors, key: size, "nees": nees}
+    record = Record(name)
+    given = {"errors": errors, key: size, "nees": nees}
+    if nees is not None:
+        given["dof"] = dof
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
-        record = record_of_arrays(stated if nees is None or dof is None else {**stated, "dof": dof}, axes, name)
+        record = record_of_arrays(stated, axes, name)
         if nees is None and dof is not None and dof != record.dof:
             raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
     arrays, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
@@ -87,7 +93,10 @@ def planned_dof(record: Record) -> int:
 
 def rate_shares(record: Record) -> int:
     """Parts that divide the false-alarm rate among them; see ``Record.parts``."""
-    return len(record.parts) + (record.optimal_gain and record.nis is not None) if record.parts else 1
+    shares = len(record.parts)
+    if shares and record.optimal_gain and record.nis is not None:
+        shares += 1
+    return max(shares, 1)
 
 
 def record_of_filter(
@@ -136,10 +145,13 @@ def _ended(record: Record, failures: Sequence[Failure]) -> Record:
     record = replace(record, failures=tuple(first[run] for run in sorted(first)))
     gone = _gone(record)
     assert gone is not None
-    arrays: dict[str, Any] = {
-        key: _without(gone, array) for key in OF_RUNS if (array := getattr(record, key)) is not None
-    }
-    return replace(record, **arrays, nis_dof=None if record.nis_dof is None else np.where(gone, 0, record.nis_dof))
+    arrays: dict[str, Any] = {}
+    for key in OF_RUNS:
+        if (array := getattr(record, key)) is not None:
+            arrays[key] = _without(gone, array)
+    if record.nis_dof is not None:
+        arrays["nis_dof"] = np.where(gone, 0, record.nis_dof)
+    return replace(record, **arrays)
 
 
 def _without(gone: Array, array: Array) -> Array:
@@ -155,9 +167,13 @@ def _require_some(name: str, there: Array, good: Array) -> None:
         raise ValueError(f"{name}, step {step}: not finite in any run; a run that failed has NaN from there on")
 
 
-def _require_runs(name: str, shape: tuple[int, ...], gone: Array | None) -> None:
-    if gone is not None and shape[:2] != gone.shape:
+def _gone_of(name: str, shape: tuple[int, ...], gone: Array | None) -> Array:
+    """Steps that are gone among innovations of this shape: none where there are no errors."""
+    if gone is None:
+        return np.zeros(shape[:2], bool)
+    if shape[:2] != gone.shape:
         raise ValueError(f"{name} has {shape[:2]} runs and steps, the errors have {gone.shape}")
+    return gone
 
 
 def _innovations(
@@ -189,8 +205,9 @@ def _vectors(
 
     A step without a measurement is masked in either, or, where the innovations are not masked, all NaN.
     """
-    v, S = in_memory("innovations", vectors), in_memory("innovation_covariances", covariances)
-    _require_runs("innovations", v.shape, gone)
+    v = in_memory("innovations", vectors)
+    S = in_memory("innovation_covariances", covariances)
+    gone = _gone_of("innovations", v.shape, gone)
     if v.ndim != 3 or 0 in v.shape or S.shape != (*v.shape, v.shape[-1]):
         raise ValueError(
             "innovations and innovation_covariances must have shapes (runs, steps, m) and (runs, steps, m, m), "
@@ -200,10 +217,13 @@ def _vectors(
     absent |= masked_steps("innovation_covariances", covariances, v.shape[:2])
     if not isinstance(vectors, np.ma.MaskedArray):
         absent |= np.isnan(v).all(axis=-1)
-    there: Array = np.asarray(~(absent if gone is None else absent | gone))
+    there: Array = np.asarray(~(absent | gone))
     _require_some("innovations", there, np.asarray(np.isfinite(v).all(axis=-1)))
     _require_some("innovation_covariances", there, np.asarray(np.isfinite(S).all(axis=(-2, -1))))
-    used, tracks, failures, S = np.zeros(there.shape, bool), [], [], S.copy()
+    used = np.zeros(there.shape, bool)
+    tracks = []
+    failures = []
+    S = S.copy()
     for run, steps in enumerate(there):
         k = np.flatnonzero(steps)
         place = steps_of("innovation_covariances", run, k)
@@ -211,7 +231,8 @@ def _vectors(
         tracks.append(Track(run, k, place, v[run, k], S[run, k]))
     longest = longest_start(tracks)
     for track in tracks:
-        k, (start, end, reason) = track.column, judged_rows(track, longest, "innovation")
+        k = track.column
+        (start, end, reason) = judged_rows(track, longest, "innovation")
         used[track.run, k[start:end]] = True
         if reason:
             reason = reason.replace("covariance", "innovation covariance")
@@ -221,26 +242,27 @@ def _vectors(
 
 def _nis(name: str, nis: ArrayLike, nis_dof: ArrayLike, gone: Array | None) -> tuple[Array, Indices, list[Failure]]:
     """NIS and its degrees of freedom, (runs, steps), which are 0 where it does not count, and failed runs."""
-    values, dof = in_memory("nis", nis), in_memory("nis_dof", nis_dof)
-    _require_runs("nis", values.shape, gone)
+    values = in_memory("nis", nis)
+    dof = in_memory("nis_dof", nis_dof)
+    gone = _gone_of("nis", values.shape, gone)
     if values.ndim != 2 or 0 in values.shape:
         raise ValueError(f"nis must have shape (runs, steps), got {values.shape}")
     if dof.ndim not in (0, 2) or (dof.ndim == 2 and dof.shape != values.shape):
         raise ValueError(f"nis_dof must be a number or have the shape of nis, {values.shape}, got {dof.shape}")
-    absent = masked_steps("nis", nis, values.shape) | (False if gone is None else gone)
+    absent = masked_steps("nis", nis, values.shape) | gone
     if dof.ndim:
         absent |= masked_steps("nis_dof", nis_dof, values.shape)
     dof = np.where(absent, 0.0, np.broadcast_to(dof, values.shape))
     if not (np.isfinite(dof).all() and (dof >= 0).all() and (dof == np.round(dof)).all()):
         raise ValueError("nis_dof must hold whole numbers, 0 where there was no innovation")
-    there, finite = np.asarray(dof > 0), np.asarray(np.isfinite(values))
+    there = np.asarray(dof > 0)
+    finite = np.asarray(np.isfinite(values))
     if (there & (values < 0)).any():
         run, step = np.argwhere(there & (values < 0))[0]
         raise ValueError(f"nis: negative in run {run}, step {step + 1}")
     _require_some("nis", there, finite)
     broken = there & ~finite
-    failures = [
-        Failure(name, int(run), int(np.argmax(broken[run])) + 1, "NIS is not finite")
-        for run in np.flatnonzero(broken.any(axis=1))
-    ]
-    return values if gone is None else _without(gone, values), dof.astype(np.int64), failures
+    failures = []
+    for run in np.flatnonzero(broken.any(axis=1)):
+        failures.append(Failure(name, int(run), int(np.argmax(broken[run])) + 1, "NIS is not finite"))
+    return _without(gone, values), dof.astype(np.int64), failures

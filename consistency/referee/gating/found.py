@@ -16,7 +16,7 @@ from consistency.referee.gating.watch import DEFAULTS, Entry, Terms, current
 
 
 @dataclass(frozen=True)
-class Look:
+class GateResult:
     """A verdict or a comparison at one false-alarm rate."""
 
     bad: bool
@@ -39,36 +39,48 @@ def marker_text(dof: int, runs: int) -> str:
     )
 
 
-def deciding_runs(result: Look, runs: int) -> int:
+def runs_to_decide(result: GateResult, runs: int) -> int:
     """Number of runs that would probably decide, above the present one; 0 for a comparison, which gives its own."""
     if result.verdict is None:
         return 0
-    shown, lost = result.verdict.equivalence, result.verdict.lost
-    deciding = (shown.runs or 0) if shown is not None and not shown.shown else 0
-    return max(runs + 1, deciding, (lost.needed or 0) if lost is not None else 0)
+    shown = result.verdict.equivalence
+    lost = result.verdict.lost
+    least = runs + 1
+    if shown is not None and not shown.shown:
+        least = max(least, shown.runs or 0)
+    if lost is not None:
+        least = max(least, lost.needed or 0)
+    return least
 
 
 def entry_of(
-    gate: str, record: Record, demand: Terms, result: Look, late: Look | None, outcome: str, least: int
+    gate: str, record: Record, demand: Terms, result: GateResult, late: GateResult | None, outcome: str, least: int
 ) -> Entry:
-    statistics = result.verdict.statistics if result.verdict is not None else {}
+    """The entry of a gate; ``late`` is its result at the whole budget, and ``least`` the runs that it asks for."""
     fields = summary_of(result)
+    if result.verdict is not None:
+        fields["statistics"] = result.verdict.statistics
     if (c := result.comparison) is not None:
-        fields |= plain({key: getattr(c, key) for key in ("distance", "standard_error")})
-        spread = {key: getattr(c, key) for key in ("at_most", "sum_error", "reference")}
+        fields |= plain({"distance": c.distance, "standard_error": c.standard_error})
+        spread = {"at_most": c.at_most, "sum_error": c.sum_error, "reference": c.reference}
         fields["spread"] = {key: value for key, value in spread.items() if np.isfinite(value)}
-        statistics = {"differences": [vars(d) for d in c.differences]}
+        fields["statistics"] = {"differences": [vars(d) for d in c.differences]}
+    if late is not None:
+        fields["late"] = summary_of(late)
+    in_place = 0.0
+    if demand.budget is not None and demand.may_fail:
+        in_place = demand.false_alarm
     return Entry(
         gate=gate, name=record.name, outcome=outcome, p_value=plain(result.p_value),
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
-        in_place=demand.false_alarm if demand.budget is not None and demand.may_fail else 0.0,
+        in_place=in_place,
         runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
         detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
-        late={} if late is None else summary_of(late), statistics=statistics, **fields,
+        **fields,
     )  # fmt: skip
 
 
-def summary_of(look: Look) -> dict[str, Any]:
+def summary_of(look: GateResult) -> dict[str, Any]:
     summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
     if look.comparison is not None:
         return summary | {"statistic": plain(look.comparison.differences[0].a)}

@@ -17,39 +17,44 @@ NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 
 def _cells(e: Entry) -> dict[str, Cell]:
     first, *rest = e.reasons
-    value, low, high = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
-    low, high = (float("inf") if end is None else end for end in (low, high))
-    p = "-" if e.p_value is None else f"{min(e.p_value, 1.0):.2g}" if e.p_value >= 1e-6 else "<1e-6"
+    value, *ends = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
+    low, high = (float("inf") if end is None else end for end in ends)
+    axis = ""
+    if e.axis:
+        axis = f" in {e.axis}"
     return {
         "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome_text(e), "verdict": Status(e.status),
-        "p": p, "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
+        "p": _p_text(e.p_value), "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs),
+        "planned": str(e.needed),
         "true / stated": Quantity(
-            value, (low, high), f" in {e.axis}" if e.axis else "", digits=".3g", is_factor=True
+            value, (low, high), axis, digits=".3g", is_factor=True
         ),
         "why": Reason(f"{e.gate} {e.name}", first, tuple(rest), None, e.outcome == "passed" or wanted(e), e.test),
         "": Reason(e.name, first, has_passed=e.outcome != "fault found"),
     }  # fmt: skip
 
 
+def _p_text(p: float | None) -> str:
+    if p is None:
+        return "-"
+    if p < 1e-6:
+        return "<1e-6"
+    return f"{min(p, 1.0):.2g}"
+
+
 HEADS = (
-    "test",
-    "gate",
-    "filter",
-    "outcome",
-    "verdict",
-    "p",
-    "false-alarm rate",
-    "runs",
-    "planned",
-    "true / stated",
-    "why",
-)
+    "test", "gate", "filter", "outcome", "verdict", "p", "false-alarm rate", "runs", "planned", "true / stated", "why",
+)  # fmt: skip
 BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "true / stated", "")  # on a terminal
 
 
 def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:
     columns = tuple(Column(head, number=head in NUMBERS) for head in heads)
-    return table(columns, [tuple(map(_cells(e).__getitem__, heads)) for e in entries], "Gates")
+    rows = []
+    for entry in entries:
+        cells = _cells(entry)
+        rows.append(tuple(cells[head] for head in heads))
+    return table(columns, rows, "Gates")
 
 
 def gate_lines(ledger: Ledger) -> list[str]:

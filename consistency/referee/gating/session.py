@@ -18,7 +18,9 @@ STATISTICS = "consistency_statistics"  # attribute of its reports: of every gate
 
 def to_property(entry: Entry) -> tuple[str, str]:
     """A pair for ``user_properties``: text, so that every reporter can carry it."""
-    data = {key: value for key, value in vars(entry).items() if key not in ("statistics", "test", "test_outcome")}
+    data = dict(vars(entry))
+    for key in ("statistics", "test", "test_outcome"):
+        del data[key]
     return PROPERTY, json.dumps(data, allow_nan=False)
 
 
@@ -46,11 +48,12 @@ class Ledger:
         if not properties and key not in self.tests:
             return
         tested = self.tests.setdefault(key, Tested(report.nodeid, report.location))
-        statistics = getattr(report, STATISTICS, None)
-        details = json.loads(statistics) if statistics else [{}] * len(properties)
-        tested.entries = [
-            Entry(**data, statistics=more, test=report.nodeid) for data, more in zip(properties, details, strict=True)
-        ]
+        details: list[dict[str, Any]] = [{}] * len(properties)
+        if statistics := getattr(report, STATISTICS, None):
+            details = json.loads(statistics)
+        tested.entries = []
+        for data, more in zip(properties, details, strict=True):
+            tested.entries.append(Entry(**data, statistics=more, test=report.nodeid))
         tested.expected_to_fail |= hasattr(report, "wasxfail")
         if report.when == "setup":  # also of a second try
             tested.outcome = ""
@@ -58,9 +61,11 @@ class Ledger:
             tested.outcome = report.outcome
 
     def entries(self) -> list[Entry]:
-        return [
-            replace(entry, test_outcome=tested.outcome) for tested in self.tests.values() for entry in tested.entries
-        ]
+        """Entries of all tests, each with the outcome of its test."""
+        entries = []
+        for tested in self.tests.values():
+            entries += [replace(entry, test_outcome=tested.outcome) for entry in tested.entries]
+        return entries
 
     def settle(self) -> list[tuple[Tested, list[str]]]:
         """Judge the gates on the budget at their final rate: tests that fail only now, and what to say."""
@@ -74,7 +79,8 @@ class Ledger:
             for i, entry in enumerate(tested.entries):
                 if entry.in_budget:
                     tested.entries[i], text = settled(entry, self.rate, self.budget, len(spent))
-                    texts += [text] if text else []
+                    if text:
+                        texts.append(text)
             if texts and not tested.expected_to_fail:
                 late.append((tested, texts))
                 tested.outcome = "failed"
@@ -82,8 +88,10 @@ class Ledger:
 
     def bound(self) -> float:
         """Largest probability that any gate fails its test by a false alarm; those that a test wants to fail cannot."""
-        own = [e.false_alarm for e in self.entries() if not e.in_budget and not wanted(e)]
-        return min(1.0, sum(own) + (self.budget or 0.0) * (self.rate is not None))
+        bound = sum(e.false_alarm for e in self.entries() if not e.in_budget and not wanted(e))
+        if self.rate is not None:
+            bound += self.budget or 0.0
+        return min(1.0, bound)
 
 
 def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry, str]:
@@ -118,9 +126,14 @@ def needed_at(entry: Entry, rate: float) -> int:
 def ending(ledger: Ledger) -> str:
     """How many gates, and the probability that any of them fails a test without a fault."""
     entries = ledger.entries()
-    bad, good = (sum(e.outcome != "passed" and wanted(e) == w for e in entries) for w in (False, True))
-    text = f"{len(entries)} gate{'s' * (len(entries) != 1)}, {bad} failed"
-    text += f", {good} failed as expected" if good else ""
+    good = sum(wanted(e) for e in entries)
+    bad = sum(e.outcome != "passed" for e in entries) - good
+    noun = "gates"
+    if len(entries) == 1:
+        noun = "gate"
+    text = f"{len(entries)} {noun}, {bad} failed"
+    if good:
+        text += f", {good} failed as expected"
     text += f"; probability that any fails without a fault at most {ledger.bound():.3g}"
     if ledger.rate is not None:
         text += f" (budget {ledger.budget:g}: {ledger.rate:.3g} for a gate)"
@@ -129,7 +142,9 @@ def ending(ledger: Ledger) -> str:
 
 def outcome_text(e: Entry) -> str:
     """Also whether the test wanted the gate to fail."""
-    return e.outcome + (" (expected)" if wanted(e) else "")
+    if wanted(e):
+        return f"{e.outcome} (expected)"
+    return e.outcome
 
 
 def wanted(e: Entry) -> bool:

@@ -20,7 +20,9 @@ def in_place_rate(budget: float, tests: int, before: int = 0) -> float:
 
     The first 10 gates of each of ``tests`` collected tests share half of the budget; later ones wait (0).
     """
-    return 0.5 * budget / (FIRST * max(tests, 1)) if before < FIRST else 0.0
+    if before >= FIRST:
+        return 0.0
+    return 0.5 * budget / (FIRST * max(tests, 1))
 
 
 def final_rate(budget: float, in_place: Sequence[float]) -> float:
@@ -35,7 +37,9 @@ def final_rate(budget: float, in_place: Sequence[float]) -> float:
     """
     rate = budget / max(len(in_place), 1)
     larger = [each for each in in_place if each > rate]
-    return (budget - sum(larger)) / (len(in_place) - len(larger)) if larger else rate
+    if not larger:
+        return rate
+    return (budget - sum(larger)) / (len(in_place) - len(larger))
 
 
 # of a gate that is told nothing else; dof plans the runs of a test without the marker: a planar pose
@@ -100,7 +104,9 @@ class Terms:
     @property
     def planned(self) -> float:
         """Largest false-alarm rate that this gate can end with."""
-        return self.false_alarm if self.budget is None else self.budget
+        if self.budget is None:
+            return self.false_alarm
+        return self.budget
 
 
 @dataclass
@@ -120,7 +126,9 @@ _watches: list[RunningTest] = []  # the running test is last; tests of a process
 
 def current() -> RunningTest:
     """The watch of the running test; outside a session one that tells nothing."""
-    return _watches[-1] if _watches else RunningTest()
+    if not _watches:
+        return RunningTest()
+    return _watches[-1]
 
 
 @contextlib.contextmanager
@@ -177,17 +185,22 @@ def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
 
 
 def plan_invocation(dof: int, terms: Terms) -> str:
-    return (
+    text = (
         f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
         f"--power {terms.power!r}"
-        + (f" --allow {terms.allow}" if terms.allow else "")
-        + (f" --lost {terms.lost!r}" if terms.lost is not None else "")
     )
+    if terms.allow:
+        text += f" --allow {terms.allow}"
+    if terms.lost is not None:
+        text += f" --lost {terms.lost!r}"
+    return text
 
 
 def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms) -> str:
     """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
-    larger = "a larger detect" if terms.lost is None else "a larger detect and a larger lost"
+    larger = "a larger detect"
+    if terms.lost is not None:
+        larger += " and a larger lost"
     return (
         f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
         f"however the steps depend on each other: {plan_invocation(dof, terms)}"
@@ -196,8 +209,11 @@ def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, t
 
 def few_to_compare(gate: str, name: str, runs: int, needed: int, terms: Terms) -> str:
     """How many runs a comparison lacks, and for what."""
+    few = "runs are"
+    if runs == 1:
+        few = "run is"
     return (
-        f"{gate}: {name} is not found worse, but {runs} run{'s are' if runs != 1 else ' is'} too few to pass: "
+        f"{gate}: {name} is not found worse, but {runs} {few} too few to pass: "
         f"{needed} find a covariance ratio farther from 1 by x{terms.detect:g} with power {terms.power:g} "
         f"at a false-alarm rate of {terms.false_alarm:.3g}, at the spread between these runs. Simulate more "
         "runs, or ask for a larger detect."

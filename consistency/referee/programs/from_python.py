@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,7 @@ def monte_carlo(
     }  # fmt: skip
     records, verdicts = _run(argv, settings, runs, estimates, truth, out, **options, **reading)
     record = _chosen(records, filter)
-    return replace(verdicts[record.name], record=record)
+    return verdicts[record.name]
 
 
 def record_of_program(

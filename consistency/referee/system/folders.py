@@ -83,8 +83,12 @@ class NewFolder:
         self, folder: Path, kind: str, overwrite: bool = False, keep_others: bool = False, within: Path | None = None
     ) -> None:
         require_free(folder, overwrite, kind)
-        self.folder, self.kind, self.overwrite, self.keep_others = folder, kind, overwrite, keep_others
-        self.within, self.is_placed = within, False
+        self.folder = folder
+        self.kind = kind
+        self.overwrite = overwrite
+        self.keep_others = keep_others
+        self.within = within
+        self.is_placed = False
         if within is not None:
             self.path = within / "tables"
             shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended
@@ -162,9 +166,11 @@ def _put_in_place(partial: Path, folder: Path, keep_others: bool, within: Path |
         return
     if keep_others:
         for path in folder.iterdir():
-            if not (partial / path.name).exists():
-                copy = shutil.copytree if path.is_dir() else shutil.copy2
-                copy(path, partial / path.name)
+            copy = partial / path.name
+            if path.is_dir() and not copy.exists():
+                shutil.copytree(path, copy)
+            elif not copy.exists():
+                shutil.copy2(path, copy)
     aside = within or partial_folder(folder, folder.parent)
     shutil.rmtree(aside / "replaced", ignore_errors=True)
     os.replace(folder, aside / "replaced")
@@ -190,7 +196,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             "continues, and with --resume --runs 1 writes what is finished"
         )
     if not folder.is_dir():
-        raise InputError(f"{folder}: {'a file, not a folder' if folder.exists() else 'no such folder'}")
+        fault = "no such folder"
+        if folder.exists():
+            fault = "a file, not a folder"
+        raise InputError(f"{folder}: {fault}")
     if not path.exists():
         raise InputError(f"{path}: missing; give a folder that 'consistency' wrote")
     manifest = read_json(path)

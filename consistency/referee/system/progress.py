@@ -103,13 +103,16 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         def advance(count: int) -> None:
             bar.advance(task, count)
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task, rate=_speed(speed, unit) if speed else "")
+            if speed:
+                bar.update(task, rate=_speed(speed, unit))
 
         yield advance
 
 
 def _speed(rate: float, unit: str) -> str:
-    return f"{rate:.1f} {unit}/s" if rate >= 1.0 else f"{1.0 / rate:.1f} s for one"
+    if rate >= 1.0:
+        return f"{rate:.1f} {unit}/s"
+    return f"{1.0 / rate:.1f} s for one"
 
 
 def _lines(label: str, total: int, unit: str, brief: bool) -> Advance:

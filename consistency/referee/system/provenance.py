@@ -8,25 +8,25 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-NOT_OURS = ("opencv",)  # brings a BLAS of its own, with which no run is computed
+NOT_OURS = "opencv"  # brings a BLAS of its own, with which no run is computed
 
 
 @functools.cache
 def _found() -> tuple[tuple[str, str], ...]:
-    try:
+    cores = set()
+    with suppress(ImportError):  # nothing is simulated then
         from threadpoolctl import threadpool_info
-    except ImportError:  # nothing is simulated then
-        libraries = []
-    else:
-        libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
-    ours = [library for library in libraries if not any(name in library["filepath"] for name in NOT_OURS)]
-    cores = sorted({str(library.get("architecture")) for library in ours})
-    return ("cpu", _cpu()), ("blas", ", ".join(cores) or "unknown")
+
+        for library in threadpool_info():
+            if library["user_api"] == "blas" and NOT_OURS not in library["filepath"]:
+                cores.add(str(library.get("architecture")))
+    return ("cpu", _cpu()), ("blas", ", ".join(sorted(cores)) or "unknown")
 
 
 def this_machine() -> dict[str, str]:
@@ -43,12 +43,11 @@ def in_words(machines: Iterable[Mapping[str, str]]) -> str:
 
 
 def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or platform.machine() or "unknown"
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or "unknown"
 
 
 SCHEMA_VERSION = 1
@@ -61,16 +60,20 @@ PACKAGES = (
 def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
     """Provenance that every output folder of a ``kind`` (results, log, findings) carries."""
     wall = fields.pop("wall", None)
+    if wall is not None:
+        wall = round(wall, 3)
     program = Path(sys.argv[0]).name
+    if program == "__main__.py":
+        program = "consistency"
     return {
         "schema_version": SCHEMA_VERSION,
         "kind": kind,
         "date": datetime.now(timezone.utc).date().isoformat(),
         "versions": dict(_versions()),
         "machines": [this_machine()],
-        "command": shlex.join(["consistency" if program == "__main__.py" else program, *sys.argv[1:]]),
+        "command": shlex.join([program, *sys.argv[1:]]),
         "git_commit": _git_commit(),
-        "wall_time_s": None if wall is None else round(wall, 3),
+        "wall_time_s": wall,
         **fields,
     }
 
@@ -101,6 +104,12 @@ def _git_commit() -> str | None:
         lines = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
         return None
-    commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "(initial)")
-    dirty = any(not line.startswith("#") for line in lines)
-    return None if commit == "(initial)" else commit + ("-dirty" if dirty else "")
+    commit, changed = None, ""
+    for line in lines:
+        if line.startswith("# branch.oid "):
+            commit = line.split()[-1]
+        elif not line.startswith("#"):
+            changed = "-dirty"
+    if commit in (None, "(initial)"):
+        return None
+    return f"{commit}{changed}"

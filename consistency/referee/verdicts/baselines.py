@@ -65,7 +65,10 @@ def baseline(
     InputError
         A filter has no NEES, or nothing of it is left.
     """
-    first, filters, failures, axes = skip_asked(skip), {}, {}, {}
+    first = skip_asked(skip)
+    filters = {}
+    failures = {}
+    axes = {}
     of_runs: dict[int, str] = {}
     source = source_of(of)
     if not source.has_truth:
@@ -75,7 +78,8 @@ def baseline(
         if record.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
         of_runs |= record.trials
-        failures[each], axes[each] = len(record.failures), tuple(record.axes)
+        failures[each] = len(record.failures)
+        axes[each] = tuple(record.axes)
         own = record
         if not record.unshown:
             own = record.as_runs
@@ -95,7 +99,8 @@ def _option(skip: Skip | None) -> str | None:
 
 
 def _digest(truth: Path) -> str:
-    digest, paths = hashlib.sha256(), [truth]
+    digest = hashlib.sha256()
+    paths = [truth]
     if not truth.is_file():
         paths = sorted(path for path in truth.rglob("*") if path.is_file())
     for path in paths:
@@ -117,17 +122,16 @@ def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
     """
     if path.exists() and not overwrite:
         raise InputError(f"--out {path}: exists already; name another file or add --overwrite")
+    filters = {}
+    for name, rows in base.filters.items():
+        filters[name] = plain(vars(rows)) | {"failures": base.failures[name], "axes": list(base.axes[name])}
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
         origin=list(base.origin),
         skip=base.skip,
         trials={str(run): trial for run, trial in base.trials.items()},
-        filters={
-            name: {key: plain(value) for key, value in vars(s).items()}
-            | {"failures": base.failures[name], "axes": list(base.axes[name])}
-            for name, s in base.filters.items()
-        },
+        filters=filters,
     )
     with writing(path):
         write_whole(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"))
@@ -170,7 +174,9 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             raise ValueError("key 'filters': not a table")
         trials = _trials_of(data.get("trials", {}))  # files written before lack it
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
-    filters, failures, axes = {}, {}, {}
+    filters = {}
+    failures = {}
+    axes = {}
     for name, row in rows.items():
         filters[name], failures[name], axes[name] = row
     base = Baseline(str(path), scenario, (origin[0], origin[1]), filters, failures, axes, left_out, trials)
@@ -187,7 +193,8 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
     """
     asked = _option(skip_asked(skip))
     if base.skip != asked:
-        own, wanted = f"with --skip {base.skip}", f"with --skip {asked}"
+        own = f"with --skip {base.skip}"
+        wanted = f"with --skip {asked}"
         if base.skip is None:
             own = "of all steps"
         if asked is None:
@@ -199,15 +206,15 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
 def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]]:
     """One filter in the file, values of R runs: a summary as the referee takes it, failed runs, names of components."""
     _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
-    runs = [_whole(run, f"{place}.runs.{k}", 0, 2**63) for k, run in enumerate(_list(table["runs"], f"{place}.runs"))]
+    runs = _list(table["runs"], f"{place}.runs")
+    for k, run in enumerate(runs):
+        _whole(run, f"{place}.runs.{k}", 0, 2**63)
     if len(set(runs)) < len(runs):
         raise ValueError(f"key '{place}.runs': a run is duplicated")
-    nees = _numbers(table["nees"], f"{place}.nees")
-    squared, covered = (
-        [_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(_list(table[key], f"{place}.{key}"))]
-        for key in ("squared", "covered")
-    )
-    parts = [np.array(values, float) for values in (nees, squared, covered)]
+    parts = [np.array(_numbers(table["nees"], f"{place}.nees"), float)]
+    for key in ("squared", "covered"):
+        rows = _list(table[key], f"{place}.{key}")
+        parts.append(np.array([_numbers(row, f"{place}.{key}.{k}", HIGHEST_DOF) for k, row in enumerate(rows)], float))
     if {len(part) for part in parts} != {len(runs)} or parts[1].shape != parts[2].shape:
         raise ValueError(f"key '{place}': its lists are not equally long")
     dof = _whole(table["dof"], f"{place}.dof", 1, HIGHEST_DOF + 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,8 @@ class Compared:
     def sentence(self) -> str:
         c = self.comparison
         own, reference = self.names
-        found, way = "not found less consistent", "as independent samples"
+        found = "not found less consistent"
+        way = "as independent samples"
         if c.worse:
             found = "less consistent"
         if c.paired:
@@ -102,10 +104,12 @@ def compare_with(
         pairs = [(next(iter(new.filters)), next(iter(old.filters)))]
     if not pairs:
         raise InputError(f"{new.name} and {old.name} have no filter in common; name one with --filter")
-    same, note = new.of_the_trials_of(old), ""
+    same = new.of_the_trials_of(old)
+    note = ""
     if new.trials and old.trials:
         old, common = _numbered_alike(new, old)
-        same, note = common >= FEWEST, f"{common} of {len(new.trials)} runs have the same seed and truth in both"
+        same = common >= FEWEST
+        note = f"{common} of {len(new.trials)} runs have the same seed and truth in both"
     elif not same:
         which = "Scenario or seed"
         if new.scenario is None and old.scenario is None:
@@ -113,9 +117,8 @@ def compare_with(
         note = f"{which} differ: the trials are not the same"
     found = []
     for a, b in pairs:
-        one = _compared(new, a, old, b, same, false_alarm)
         as_many = len(new.filters[a].runs) == len(old.filters[b].runs)
-        found.append(replace(one, note=note, same_runs=as_many or not new.trials))
+        found.append(_compared(new, a, old, b, same, false_alarm, note, as_many or not new.trials))
     return found
 
 
@@ -126,14 +129,24 @@ def _numbered_alike(new: Baseline, old: Baseline) -> tuple[Baseline, int]:
     """
     number = {trial: run for run, trial in new.trials.items()}
     renamed = {run: number.get(trial, -1 - run) for run, trial in old.trials.items()}
-    filters = {
-        name: replace(rows, runs=np.array([renamed.get(int(run), -1 - int(run)) for run in rows.runs], np.int64))
-        for name, rows in old.filters.items()
-    }
+    filters = {}
+    for name, rows in old.filters.items():
+        runs = [renamed.get(int(run), -1 - int(run)) for run in rows.runs]
+        filters[name] = replace(rows, runs=np.array(runs, np.int64))
     return replace(old, filters=filters), sum(run >= 0 for run in renamed.values())
 
 
-def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, false_alarm: float) -> Compared:
+def _compared(
+    a: Baseline,
+    of_a: str,
+    b: Baseline,
+    of_b: str,
+    true_pairs: bool,
+    false_alarm: float,
+    note: str = "",
+    same_runs: bool = True,
+) -> Compared:
+    """Filter ``of_a`` of ``a`` against ``of_b`` of ``b``; run by run where these are ``true_pairs``."""
     for base, name in ((a, of_a), (b, of_b)):
         if name not in base.filters:
             raise InputError(f"--filter {name}: is not in {base.name}; there are: {', '.join(base.filters)}")
@@ -151,16 +164,15 @@ def _compared(a: Baseline, of_a: str, b: Baseline, of_b: str, true_pairs: bool, 
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
     failures = FailedRuns(a.failures[of_a], b.failures[of_b])
-    return Compared(of_a, of_b, comparison, failures, sources=(a.name, b.name))
+    return Compared(of_a, of_b, comparison, failures, note, same_runs, (a.name, b.name))
 
 
-def document(compared: Sequence[Compared]) -> Document:
+def comparison_document(compared: Sequence[Compared]) -> Document:
+    """Tables and sentences of comparisons, and their numbers."""
     blocks: list[Block] = []
+    data: list[dict[str, Any]] = []
     for each in compared:
         blocks += [comparison_table(*each.names, each.comparison), Text(each.sentence), Text("")]
-    data = [
-        {"a": each.a, "b": each.b, "worse": each.worse, "sentence": each.sentence, "failures": each.failures}
-        | asdict(each.comparison)
-        for each in compared
-    ]
+        numbers = {"a": each.a, "b": each.b, "worse": each.worse, "sentence": each.sentence, "failures": each.failures}
+        data.append(numbers | asdict(each.comparison))
     return Document("", "", (), tuple(blocks), data)

@@ -44,7 +44,9 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
         The declaration is missing, or an option is out of its range.
     """
     if innovations != OPTIMAL:
-        value = "" if innovations is None else f", got '{innovations}'"
+        value = ""
+        if innovations is not None:
+            value = f", got '{innovations}'"
         raise InputError(
             f"--innovations must be '{OPTIMAL}'{value}: declare that the filter has the optimal (Kalman) gain for its "
             "model. Of any other filter the innovations are not white, and no false-alarm rate holds"
@@ -79,9 +81,11 @@ def watch(log: NisLog, monitor: Monitor) -> Watched:
     for row, (nis, dof) in enumerate(zip(log.nis.tolist(), log.dof.tolist(), strict=True)):
         monitor.update(nis, int(dof))
         evidence[row] = monitor.evidence
-    alarm, times = monitor.alarm, (math.nan, math.nan)
+    alarm = monitor.alarm
+    times = (math.nan, math.nan)
     if alarm is not None:
-        row, since = alarm.step - 1, alarm.since - 1
+        row = alarm.step - 1
+        since = alarm.since - 1
         times = float(log.t[row]), float(log.t[since])
         alarm = replace(alarm, step=int(log.step[row]), since=int(log.step[since]))
     with np.errstate(divide="ignore", invalid="ignore"):

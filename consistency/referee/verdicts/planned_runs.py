@@ -55,23 +55,26 @@ def plan(
         raise InputError(f"--dof {dof}: results of the bench have {pilot_dof} dimensions; leave it out")
     try:
         runs = gate_runs(dof, detect, false_alarm, power, allow, lost)
-        looks = list(itertools.takewhile(lambda n: n < runs, (n for n, spent in Design(dof).inspections() if spent)))
+        inspections = itertools.takewhile(lambda one: one[0] < runs, Design(dof).inspections())
+        looks = [count for count, spent in inspections if spent]
         planned: dict[str, Any] = {
             "dof": dof, "detect": detect, "false_alarm": false_alarm, "power": power, "allow": allow, "runs": runs,
             "one_step": required_runs(dof, detect, false_alarm, power, two_sided=allow is None), "looks": looks,
         }  # fmt: skip
-        planned |= {} if lost is None else {"lost": lost, "lost_runs": lost_runs(lost, power)}
+        if lost is not None:
+            planned |= {"lost": lost, "lost_runs": lost_runs(lost, power)}
         if groups is not None:
             each = group_runs(dof, detect, groups, false_alarm, power, allow)
             planned |= {"groups": groups, "runs_in_group": each, "group_runs": groups * each}
         if pilots is not None:
-            planned["like"] = {
-                name: vars(pilot_plan(means, dof, steps, detect, false_alarm, power, allow, lost))
-                for name, (means, steps) in pilots.items()
-            }
-        return planned
+            planned["like"] = {}
+            for name, (means, steps) in pilots.items():
+                planned["like"][name] = vars(pilot_plan(means, dof, steps, detect, false_alarm, power, allow, lost))
+    except InputError:
+        raise
     except ValueError as error:
-        raise error if isinstance(error, InputError) else refused(error) from None
+        raise refused(error) from None
+    return planned
 
 
 def pilots_of_records(

@@ -74,12 +74,15 @@ def judge_all(
     optimal_gain: bool = False,
 ) -> dict[str, Verdict]:
     """Judge every filter of the records, or those named; :func:`consistency.analyse` has the parameters."""
-    source, design = source_of(results), None
+    source = source_of(results)
+    design = None
     if settings is None:
         settings = settings_of(confidence)
         if confidence is None:
-            settings, design = source.settings or settings, source.design()
-    first, verdicts = skip_asked(skip) or source.skip, {}
+            settings = source.settings or settings
+            design = source.design()
+    first = skip_asked(skip) or source.skip
+    verdicts = {}
     for name in filters or source.filters:
         record = source.record(name)
         if first is not None and record.skipped is None:

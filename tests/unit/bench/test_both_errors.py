@@ -13,7 +13,7 @@ import consistency as cs
 from consistency.bench.filters.stepping import run_filter, step_through
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.results_to_records import record_of, results_source
-from consistency.bench.runs.run_scores import run_means
+from consistency.bench.runs.run_scores import mean_nees_of_runs
 from consistency.bench.runs.sequential import run_until_decided
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Interval, Settings, judge, map_score, sequential_design
@@ -136,9 +136,9 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results):
 
 def test_run_means_and_baselines_are_of_the_own_error(results):
     c = record_of(results, "right")
-    assert_allclose(run_means(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
+    assert_allclose(mean_nees_of_runs(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
     of = baseline(results_source(results)).filters["right"]
-    assert_allclose(of.nees, run_means(c) / 3.0, rtol=1e-12)
+    assert_allclose(of.nees, mean_nees_of_runs(c) / 3.0, rtol=1e-12)
     world, counted = c.in_world, np.isfinite(c.nees)[..., None]
     square = np.nanmean(np.where(counted, np.square(world.error), np.nan), axis=1)
     assert_allclose(of.squared, square, rtol=1e-12)

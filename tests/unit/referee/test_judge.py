@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy import stats
 
-from consistency.bench.runs.run_scores import run_means, wins
+from consistency.bench.runs.run_scores import mean_nees_of_runs, wins
 from consistency.diagnostics import Record
 from consistency.referee.types import Failure
 
@@ -19,12 +19,12 @@ def record_of(nees, failed=(), first=0):
 def test_run_means_by_hand():
     nan = np.nan
     nees = np.array([[1.0, 2.0, 6.0], [nan, 2.0, 4.0], [0.5, nan, nan], [nan, nan, nan]])
-    assert_array_equal(run_means(record_of(nees)), [3.0, 3.0, 0.5, np.inf])
+    assert_array_equal(mean_nees_of_runs(record_of(nees)), [3.0, 3.0, 0.5, np.inf])
 
 
 def test_a_failed_run_is_infinite_whatever_it_had_before():
     nees = np.array([[1.0, np.nan], [1.0, 1.0], [0.1, np.nan]])
-    assert_array_equal(run_means(record_of(nees, failed=(5, 7), first=5)), [np.inf, 1.0, np.inf])
+    assert_array_equal(mean_nees_of_runs(record_of(nees, failed=(5, 7), first=5)), [np.inf, 1.0, np.inf])
 
 
 def test_a_failed_run_loses():

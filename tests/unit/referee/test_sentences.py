@@ -251,13 +251,20 @@ def test_steps_above_and_below_are_counted_apart(rng):
     assert "too small" not in turned.reasons[0]
 
 
+def only(verdict, question):
+    """The verdict where this question alone found a fault."""
+    answers = tuple(replace(answer, found=answer.question == question) for answer in verdict.answers)
+    return replace(verdict, answers=answers)
+
+
 def test_the_larger_side_comes_first(rng):
     error = independent(rng, 100, 100, 2)
     error[:, 10] *= 0.68
     error[:, 40:43] *= 2.2
     verdict = judged(error)
-    steps = replace(verdict, location=replace(verdict.location, lasting=False), status="overconfident")
-    said = scale_text(steps, {"scale in some step": steps.answers[0]})
+    location = replace(verdict.location, lasting=False)
+    steps = replace(only(verdict, "scale in some step"), location=location, status="overconfident")
+    said = scale_text(steps)
     worst = np.square(error).mean(axis=(0, 2)).max()
     assert said.startswith(f"covariance too small by up to x{worst:.2f} in 3 of 100 steps, first in step 41")
 
@@ -300,4 +307,6 @@ def test_a_shape_in_a_step_says_which(rng):
     error[:, 4, 1] = 0.95 * error[:, 4, 0] + np.sqrt(1 - 0.95**2) * error[:, 4, 1]
     verdict = judged(error)
     assert verdict.faults[0] == "shape in some step"
-    assert re.search(r"correlation \+0\.9\d, stated \+0\.00, of x and y in step 5$", shape_text(verdict, {}))
+    assert re.search(
+        r"correlation \+0\.9\d, stated \+0\.00, of x and y in step 5$", shape_text(only(verdict, "shape in some step"))
+    )

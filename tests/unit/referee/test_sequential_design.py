@@ -15,7 +15,7 @@ from consistency.diagnostics import Design, Record, Verdict, e_process, ever, fo
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
-from consistency.referee.diagnostics.statistics import e_process as betting
+from consistency.referee.diagnostics.statistics import nees as betting
 from consistency.referee.types import Failure
 
 SURE = 1e-5

@@ -16,7 +16,7 @@ from scipy import stats
 from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.judging import error_parts
 from consistency.referee.diagnostics.questions.shape import pair_p_values
-from consistency.referee.diagnostics.verdict.parts import Axes, Interval
+from consistency.referee.diagnostics.verdict.parts import ComponentRatios, Interval
 from consistency.referee.diagnostics.words.blocks import block_text, unlike_text
 from consistency.referee.diagnostics.words.sentences import reasons
 
@@ -186,7 +186,7 @@ def of(ratios, status="overconfident", subset=None):
     for block, members in (("position", "xyz"), ("attitude", ("roll", "pitch", "yaw"))):
         if block in ratios:
             groups[block] = [i for i, name in enumerate(names) if name in members]
-    axes = Axes(names, groups, {name: Interval(*ratio) for name, ratio in ratios.items()})
+    axes = ComponentRatios(names, groups, {name: Interval(*ratio) for name, ratio in ratios.items()})
     return SimpleNamespace(axes=axes, status=status, settings=Settings(), location=SimpleNamespace(subset=subset))
 
 

@@ -43,7 +43,7 @@ class FilterpyEkf(ExtendedKalman):
         self.sensors = ("uvd",) if uvd else ("xyz", "uvd")
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        ekf = _Ekf(state, lambda x: np.concatenate([basics.move(x[:3], control), x[3:]]))
+        ekf = _Ekf(state, lambda x: np.concatenate([basics.pose_after(x[:3], control), x[3:]]))
         ekf.F = np.eye(len(state.x))
         ekf.F[:3, :3], G = basics.motion_jacobians(state.x[:3], control)
         ekf.Q = np.pad(basics.process_noise(G, state.problem.belief), (0, len(state.x) - 3))
@@ -62,7 +62,7 @@ class FilterpyUkf(FilterpyEkf):
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         def f(x: Array, dt: float) -> Array:
-            return np.concatenate([basics.move(x[:3], control), x[3:]])
+            return np.concatenate([basics.pose_after(x[:3], control), x[3:]])
 
         ukf = _ukf(state, np.arange(3), f, lambda x: x[:3])
         _, G = basics.motion_jacobians(state.x[:3], control)

@@ -33,7 +33,7 @@ import numpy as np
 from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import heading_matrix, mounted
-from consistency.bench.filters.textbook.inverse_range import rays, untruncated
+from consistency.bench.filters.textbook.inverse_range import unit_vectors, untruncated_disparity
 from consistency.bench.models import stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Control, Gaussian, Observation
@@ -81,7 +81,7 @@ class PlanarStereo:
 
     def moved(self, pose: Array, control: Control) -> Array:
         """Pose (3,) after a step without noise."""
-        return basics.move(pose, control)
+        return basics.pose_after(pose, control)
 
     def motion(self, step: int, control: Control) -> gtsam.CustomFactor:
         """From the pose before to that of ``step``: the way in the frame of the pose before, and the turn."""
@@ -187,13 +187,13 @@ class PlanarStereo:
         if sensor.disparity is None:
             return d, np.full(len(d), sigma**2)
         low, high = sensor.disparity
-        return untruncated(d, expected, sigma, (low - shift, high - shift))
+        return untruncated_disparity(d, expected, sigma, (low - shift, high - shift))
 
     # --- landmarks -------------------------------------------------------------------------------
 
     def point(self, label: int, landmark: Gaussian) -> Gaussian:
         """A landmark as a point in the world, m."""
-        rho, (ray, by_angles) = landmark.mean[2], rays(landmark.mean)
+        rho, (ray, by_angles) = landmark.mean[2], unit_vectors(landmark.mean)
         J = np.column_stack([by_angles, -ray / rho]) / rho
         P = J @ landmark.covariance @ J.T
         return Gaussian(self.origins[label] + ray / rho, (P + P.T) / 2.0)

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, SlamState, heading_matrix
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.filters.textbook.inverse_range import rays
+from consistency.bench.filters.textbook.inverse_range import unit_vectors
 from consistency.bench.protocols import Problem
 from consistency.bench.types import Gaussian, Info
 from consistency.referee.types import Array
@@ -65,5 +65,5 @@ class AnchoredKalman(ExtendedKalman):
 
 def anchored_point(values: Array) -> tuple[Array, Array]:
     """Point (3,) in the world of a landmark's six numbers, with its Jacobian (3, 6)."""
-    rho, (ray, by_angles) = values[5], rays(values[3:])
+    rho, (ray, by_angles) = values[5], unit_vectors(values[3:])
     return values[:3] + ray / rho, np.column_stack([np.eye(3), by_angles / rho, -ray / rho**2])

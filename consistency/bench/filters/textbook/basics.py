@@ -156,7 +156,7 @@ def start(problem: Problem, width: int | None = None) -> SlamState:
     return SlamState(problem.start.copy(), np.zeros((3, 3)), (), problem, width or own)
 
 
-def move(pose: Array, control: Control) -> Array:
+def pose_after(pose: Array, control: Control) -> Array:
     """Pose (3,) after a step, eq. 18."""
     return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
 
@@ -184,7 +184,7 @@ def predict_by(state: SlamState, control: Control, displacement: Array, at: Arra
     """Eq. 9 and 10 with F of another ``displacement`` (2,) of the robot, in m, and G at the pose ``at`` (3,)."""
     x, F = state.x.copy(), np.eye(len(state.x))
     _, G = motion_jacobians(at, control)
-    x[:3] = move(x[:3], control)
+    x[:3] = pose_after(x[:3], control)
     F[:2, 2] = quarter_turn(displacement)
     P = F @ state.P @ F.T
     P[:3, :3] += process_noise(G, state.problem.belief)

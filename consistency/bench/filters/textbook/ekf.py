@@ -29,7 +29,7 @@ class ExtendedKalman:
         """Eq. 9 and 10 with Jacobians at the estimate: the mean moves by f, P <- F P F' + G Q G'."""
         x, F = state.x.copy(), np.eye(len(state.x))
         F[:3, :3], G = basics.motion_jacobians(x[:3], control)
-        x[:3] = basics.move(x[:3], control)
+        x[:3] = basics.pose_after(x[:3], control)
         P = F @ state.P @ F.T
         P[:3, :3] += basics.process_noise(G, state.problem.belief)
         return replace(state, x=x, P=P)

@@ -42,7 +42,7 @@ class EquivariantKalman(ExtendedKalman):
     error = "right"
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        before, after = state.x[:3], basics.move(state.x[:3], control)
+        before, after = state.x[:3], basics.pose_after(state.x[:3], control)
         t, A = mounted(state.problem.belief.sensor)
         _, G = basics.motion_jacobians(before, control)
         to_sensor = A.T @ heading_matrix(after[2]).T  # of a direction in the world

@@ -27,7 +27,7 @@ class FirstEstimateKalman(ExtendedKalman):
         return replace(basics.start(problem), points=problem.start.copy())
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
-        predicted = basics.move(state.x[:3], control)
+        predicted = basics.pose_after(state.x[:3], control)
         after = basics.predict_by(state, control, predicted[:2] - state.points[:2], state.x[:3])
         return replace(after, points=np.concatenate([predicted, state.points[3:]]))
 

@@ -46,7 +46,7 @@ class Corrections(NamedTuple):
 # --- geometry ----------------------------------------------------------------------------------------
 
 
-def rays(y: Array) -> tuple[Array, Array]:
+def unit_vectors(y: Array) -> tuple[Array, Array]:
     """Unit vectors (..., 3) of azimuth and elevation, and their derivatives (..., 3, 2)."""
     (sa, se), (ca, ce) = np.sin(y[..., :2]).T, np.cos(y[..., :2]).T
     sa, se, ca, ce = sa.T, se.T, ca.T, ce.T
@@ -56,7 +56,7 @@ def rays(y: Array) -> tuple[Array, Array]:
     return m, np.stack([by_azimuth, by_elevation], axis=-1)
 
 
-def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array, Array, Array, Array]:
+def in_new_frame(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array, Array, Array, Array]:
     """Landmarks y (m, 3) in the frame of the sensor after a change b -> R b + t of the robot's frame.
 
     Returns
@@ -64,7 +64,7 @@ def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array
     y' (m, 3), dy'/dy (m, 3, 3), dy'/db' (m, 3, 3), and rho times the point in the new frame of the robot, b' (m, 3)
     """
     offset, axes = mounted(sensor)
-    m, dm = rays(y)
+    m, dm = unit_vectors(y)
     rho = y[:, 2:]
     b = (m @ axes.T + rho * offset) @ R.T + rho * t
     q = (b - rho * offset) @ axes
@@ -82,7 +82,7 @@ def carried(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array
     return there, J, D @ axes.T, b
 
 
-def bent(q: Array, rho: Array, w: Array) -> Array:
+def second_derivative(q: Array, rho: Array, w: Array) -> Array:
     """Second derivative (m, 3) of azimuth, elevation and rho / |q| along q + s w, at s = 0; q, w (m, 3), rho (m,)."""
     h2, r2 = (q[:, :2] ** 2).sum(axis=1), (q**2).sum(axis=1)
     h, r = np.sqrt(h2), np.sqrt(r2)
@@ -95,7 +95,7 @@ def bent(q: Array, rho: Array, w: Array) -> Array:
     return np.stack([azimuth, elevation, rho * (2.0 * dr**2 / r - ddr) / r2], axis=1)
 
 
-def curvature(
+def mean_shift(
     b: Array, rho: Array, D: Array, along: Array, noise: tuple[float, float], sensor: BelievedSensor
 ) -> Array:
     """What noise of drive and of turn adds to the mean of landmarks, to second order, (m, 3, 2).
@@ -105,15 +105,15 @@ def curvature(
 
     Parameters
     ----------
-    b, rho, D : (m, 3), (m,), (m, 3, 3), as of :func:`carried`
+    b, rho, D : (m, 3), (m,), (m, 3, 3), as of :func:`in_new_frame`
     along : (3,), direction of the drive in the new frame of the robot
     noise : standard deviations of drive (m) and turn (rad)
     """
     offset, axes = mounted(sensor)
     q, flat = (b - rho[:, None] * offset) @ axes, b * [1.0, 1.0, 0.0]
     by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
-    of_turn = bent(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
-    of_drive = bent(q, rho, -rho[:, None] * (along @ axes))
+    of_turn = second_derivative(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
+    of_drive = second_derivative(q, rho, -rho[:, None] * (along @ axes))
     return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
 
 
@@ -154,7 +154,7 @@ def shift_matrix(pose: Array) -> Array:
     return np.array([[1.0, 0.0, pose[1]], [0.0, 1.0, -pose[0]], [0.0, 0.0, 1.0]])
 
 
-def left_jacobian(xi: Array) -> Array:
+def pose_jacobian(xi: Array) -> Array:
     """J_l of SE(2) to second order, (3, 3)."""
     ad = np.array([[0.0, -xi[2], xi[1]], [xi[2], 0.0, -xi[0]], [0.0, 0.0, 0.0]])
     return np.asarray(np.eye(3) + ad / 2.0 + ad @ ad / 6.0)
@@ -166,7 +166,7 @@ def poses_moved(poses: Array, xi: Array, recency: bool = False) -> tuple[Array, 
     With ``recency`` the last pose is moved by the noise of its last motion, whose errors come after all older ones:
     T_true = Exp(xi) Exp(nu) T, so that T moved by nu has the error xi, not J_l(nu) xi.
     """
-    J = np.array([left_jacobian(x) for x in xi])
+    J = np.array([pose_jacobian(x) for x in xi])
     if recency:
         J[-1] = np.eye(3)
     return np.array([moved_pose(pose, x) for pose, x in zip(poses, xi, strict=True)]), block_diag(*J)
@@ -186,7 +186,7 @@ def chained(poses: Array, xi: Array, on: int) -> tuple[Array, Array]:
             last = on if j == len(xi) - 1 else j - 1
             before, step, rows[j] = E[last], xi[j] - xi[last], rows[last]
         M = shift_matrix(before) @ heading_matrix(before[2])  # Ad
-        B = M @ left_jacobian(step)
+        B = M @ pose_jacobian(step)
         rows[j, :, 3 * j : 3 * j + 3] += B
         if j > 0:
             rows[j, :, 3 * last : 3 * last + 3] -= B
@@ -234,7 +234,7 @@ def conversion_bias(z: Array, sensor: BelievedSensor) -> Array:
     return b
 
 
-def untruncated(
+def untruncated_disparity(
     d: Array, expected: Array, sigma: Array | float, searched: tuple[Array | float, Array | float]
 ) -> tuple[Array, Array]:
     """What d would be without the search range, and its variance: moments of the truncated normal about ``expected``.
@@ -282,7 +282,7 @@ def observed(
     variance[:, 2] = np.square(sigma)
     if which.truncation:
         low, high = searched(sensor, "robot-centred")
-        z[:, 2], variance[:, 2] = untruncated(z[:, 2], at[:, 2], sigma, (low - shift, high - shift))
+        z[:, 2], variance[:, 2] = untruncated_disparity(z[:, 2], at[:, 2], sigma, (low - shift, high - shift))
     y, J = converted(z, sensor)[0], converted(at if which.prediction else z, sensor)[1]
     if which.debiasing:
         y -= conversion_bias(z, sensor)

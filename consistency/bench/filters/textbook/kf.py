@@ -28,7 +28,7 @@ class LinearKalman(ExtendedKalman):
 
     def predict(self, state: SlamState, control: Control) -> SlamState:
         F, G = basics.motion_jacobians(state.points, control)
-        reference = basics.move(state.points, control)
+        reference = basics.pose_after(state.points, control)
         x, P = state.x.copy(), state.P.copy()
         x[:3] = reference + F @ (x[:3] - state.points)
         P[:3] = F @ P[:3]

@@ -31,7 +31,7 @@ class ConstrainedKalman(ExtendedKalman):
     def predict(self, state: SlamState, control: Control) -> SlamState:
         x, turned = state.x, state.points.copy()
         shift = np.mean(x[state.positions] - turned, axis=0)
-        predicted = basics.move(x[:3], control)
+        predicted = basics.pose_after(x[:3], control)
         after = basics.predict_by(state, control, predicted[:2] - (turned[0] + shift), x[:3])  # predicted less p*
         turned[0] = predicted[:2] - shift
         return replace(after, points=turned)

@@ -30,7 +30,7 @@ class RightInvariantKalman(ExtendedKalman):
         n, x = len(state.x), state.x.copy()
         F, G = np.eye(n), np.zeros((n, 2))
         F[:3, :3], G[:3] = basics.motion_jacobians(x[:3], control)
-        x[:3] = basics.move(x[:3], control)
+        x[:3] = basics.pose_after(x[:3], control)
         back, w = np.linalg.inv(additive_from_right(x, state.width)), state.width
         F, G = back @ F @ additive_from_right(state.x, w), back @ G
         return replace(state, x=x, P=F @ state.P @ F.T + basics.process_noise(G, state.problem.belief))

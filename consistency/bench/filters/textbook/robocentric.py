@@ -49,11 +49,11 @@ from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import heading_matrix
 from consistency.bench.filters.textbook.inverse_range import (
     Corrections,
-    carried,
     chained,
     conversion_bias,
     converted,
-    curvature,
+    in_new_frame,
+    mean_shift,
     observed,
     pose_moments,
     poses_moved,
@@ -142,15 +142,15 @@ class RobotCentredKalman:
         F[:3, :3], G[:3] = basics.motion_jacobians(x[:3], control)
         sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
         bends = np.zeros((n, 2))
-        x[:3] = basics.move(x[:3], control)
+        x[:3] = basics.pose_after(x[:3], control)
         active = [at for label, at in state.places.items() if label not in state.parked]
         if active:
             rows = np.array(active)[:, None] + np.arange(3)
             forward, turn = control.dt * control.v, control.dt * control.omega
             R = heading_matrix(-turn)
-            y, J, D, b = carried(x[rows], R, -R[:, 0] * forward, belief.sensor)
+            y, J, D, b = in_new_frame(x[rows], R, -R[:, 0] * forward, belief.sensor)
             rho = x[rows][:, 2:]
-            bends[rows] = curvature(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
+            bends[rows] = mean_shift(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
             x[rows] = y + bends[rows].sum(axis=2) if self.which.curvature else y
             if self.which.spread:  # of the drive, and of the error of rho times it
                 along = D @ R[:, 0]

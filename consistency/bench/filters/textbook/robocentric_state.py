@@ -12,12 +12,12 @@ import numpy as np
 
 from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.filters.textbook.inverse_range import (
-    carried,
-    left_jacobian,
+    in_new_frame,
     moved_pose,
+    pose_jacobian,
     poses_moved,
-    rays,
     shift_matrix,
+    unit_vectors,
 )
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
@@ -94,7 +94,7 @@ def shifts_of(state: CentredState) -> Array:
 def clone_of(state: CentredState, number: int) -> tuple[slice, Array, Array]:
     """Where a clone is in the state, its pose (3,), and d xi about that pose / d xi about its origin (3, 3)."""
     at = block_at(state.clones[number])
-    return at, moved_pose(state.origins[number], state.x[at]), left_jacobian(state.x[at])
+    return at, moved_pose(state.origins[number], state.x[at]), pose_jacobian(state.x[at])
 
 
 def expectation(state: CentredState, seen: list[int]) -> tuple[Array, Array]:
@@ -116,7 +116,7 @@ def seen_from(state: CentredState, clone: Array, y: Array) -> tuple[Array, Array
     pose = state.x[:3]
     Rt = heading_matrix(pose[2]).T
     R, t = Rt @ heading_matrix(clone[2]), Rt @ np.array([*(clone[:2] - pose[:2]), 0.0])
-    (there,), (J,), (D,), (b,) = carried(y[None], R, t, state.problem.belief.sensor)
+    (there,), (J,), (D,), (b,) = in_new_frame(y[None], R, t, state.problem.belief.sensor)
     W = Rt.T @ b + y[2] * np.array([*pose[:2], 0.0])  # rho times the point in the world
     by_shift = np.column_stack([y[2] * Rt[:, 0], y[2] * Rt[:, 1], Rt @ [-W[1], W[0], 0.0]])
     return there, J, D @ by_shift
@@ -175,7 +175,7 @@ def point_in_world(state: CentredState, label: int) -> tuple[Array, Array]:
     if label in state.parked:
         frame, pose, to_shift = clone_of(state, state.parked[label])
     offset, axes = mounted(state.problem.belief.sensor)
-    (m,), (dm,) = rays(state.x[at][None])
+    (m,), (dm,) = unit_vectors(state.x[at][None])
     rho, R = state.x[at][2], heading_matrix(pose[2])
     point = R @ (axes @ m / rho + offset) + np.array([*pose[:2], 0.0])
     D = np.zeros((3, len(state.x)))

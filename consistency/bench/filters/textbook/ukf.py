@@ -42,7 +42,7 @@ class UnscentedKalman(ExtendedKalman):
         belief = state.problem.belief
         points, wm, wc = sigma_points(state.x, state.P, np.arange(3), self.points or belief.sigma_points)
         moved = points.copy()
-        moved[:, :3] = [basics.move(p[:3], control) for p in points]
+        moved[:, :3] = [basics.pose_after(p[:3], control) for p in points]
         x = wm @ moved
         P = (moved - x).T @ (wc[:, None] * (moved - x))
         _, G = basics.motion_jacobians(state.x[:3], control)

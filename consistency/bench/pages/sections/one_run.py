@@ -29,7 +29,7 @@ START = Look("#ffffff", size=8.0, edge=TRUTH)
 
 
 @dataclass(frozen=True)
-class World:
+class DrawnWorld:
     """Paths of one run of T steps, in m."""
 
     study: Study
@@ -39,10 +39,10 @@ class World:
     landmarks: Array | None  # (N, 2)
 
 
-def read(study: Study) -> World:
+def read(study: Study) -> DrawnWorld:
     """What the results hold of the shown run."""
     landmarks = study.results.landmarks
-    return World(
+    return DrawnWorld(
         study,
         tuple((track, _path(study, track.name)) for track in study.tracks),
         _truth(study),
@@ -104,7 +104,7 @@ def world_map(study: Study) -> tuple[Figure, ...]:
     return (Figure(f"Scenario and estimates, run {study.shown_run}", map_caption(world), (draw,)),)
 
 
-def map_caption(world: World) -> str:
+def map_caption(world: DrawnWorld) -> str:
     parts = []
     if world.truth is not None:
         parts.append("true path solid with its start as a circle")

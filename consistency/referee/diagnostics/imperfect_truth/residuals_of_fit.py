@@ -54,8 +54,10 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     shared : one fit for all runs; else each run has its own
 
     """
-    longest, n = max(map(len, residuals)), residuals[0].shape[1]
-    kernels, edges = _kernels(longest, shared), _bins(longest)
+    longest = max(map(len, residuals))
+    n = residuals[0].shape[1]
+    kernels = _kernels(longest, shared)
+    edges = _bins(longest)
     every = kernels
     if not shared:
         every = np.concatenate([kernels, _slower(longest)])
@@ -93,8 +95,10 @@ def inflation_of_mean(residuals: Sequence[Array], bases: Sequence[Array]) -> flo
     means = np.array([r.mean(axis=0) for r in residuals])
     scores = np.array([np.einsum("kap,ka->p", Q, r) for Q, r in zip(bases, residuals, strict=True)])
     q = np.mean([Q.mean(axis=0) for Q in bases], axis=0)
-    parts, N = means / len(means) - scores @ q.T, len(means)
-    variance, assumed = N * parts.T @ parts, np.atleast_2d(np.cov(means.T))
+    parts = means / len(means) - scores @ q.T
+    N = len(means)
+    variance = N * parts.T @ parts
+    assumed = np.atleast_2d(np.cov(means.T))
     little = np.finfo(float).eps * max(float(np.trace(variance)), np.finfo(float).tiny)
     return float(linalg.eigh(variance, assumed + little * np.eye(len(variance)), eigvals_only=True)[-1])
 
@@ -105,7 +109,8 @@ def _oscillate(seen: Array, expected: Array, pairs: Array) -> bool:
     weights = _weights(*(values.sum(axis=0) for values in (seen, expected, pairs)))
     off = seen - np.einsum("iambj,bj->iam", expected, weights)
     for each in (off, off.sum(axis=1)):
-        mean, spread = each.mean(axis=0), each.std(axis=0, ddof=1) / np.sqrt(N)
+        mean = each.mean(axis=0)
+        spread = each.std(axis=0, ddof=1) / np.sqrt(N)
         t = mean[spread > 0] / spread[spread > 0]
         if (distributions.t.cdf(t, N - 1) * mean.size <= 0.5 * DOUBT).any():
             return True
@@ -138,7 +143,8 @@ def _shares(seen: Array, expected: Array, pairs: Array) -> Array:
 
 def _error(seen: Array, expected: Array, pairs: Array) -> float:
     """Standard error of the logarithm of all variance that is left, by the jackknife over runs."""
-    N, parts = len(seen), (seen, expected, pairs)
+    N = len(seen)
+    parts = (seen, expected, pairs)
     at_lag_0 = expected[:, :, 0].sum(axis=(0, 1))
     logs = np.log([(_shares(*(v.sum(axis=0) - v[i] for v in parts)) * at_lag_0).sum() for i in range(N)])
     return float(np.sqrt((N - 1) / N * np.square(logs - logs.mean()).sum()))
@@ -200,7 +206,8 @@ def _products(r: Array) -> Array:
 
 def _times(kernels: Array, Q: Array) -> Array:
     """Toeplitz matrices times Q, kernel i of ``kernels`` (n, longest) times component i: (T, n, d) -> (T, n, d)."""
-    T, size = len(Q), _size(len(Q))
+    T = len(Q)
+    size = _size(len(Q))
     around = np.zeros((size, len(kernels)))
     around[:T] = kernels[:, :T].T
     around[size - T + 1 :] = around[T - 1 : 0 : -1]
@@ -216,11 +223,14 @@ def _expected(bases: Sequence[Array], kernels: Array, edges: Array, shared: bool
     With B = C Q and G = Q' B the covariance of residuals is C - Q B' - B Q' + Q G Q', in which G is that of all runs
     where they share the fit.
     """
-    N, (_, n, d), J = len(bases), bases[0].shape, len(kernels)
+    N = len(bases)
+    (_, n, d) = bases[0].shape
+    J = len(kernels)
     out = np.zeros((N, n, len(edges) - 1, n, J))
     G = np.zeros((N, J, n, d, d))
     for i, Q in enumerate(bases):
-        T, F = len(Q), _spectrum(Q)
+        T = len(Q)
+        F = _spectrum(Q)
         plain = _binned((T - np.arange(T)) * kernels[:, :T], edges)
         for j, kernel in enumerate(kernels):
             B = _times(np.tile(kernel, (n, 1)), Q)

@@ -53,7 +53,8 @@ def fit_shared(errors: Array, J: Array, S: Array, prior: Array) -> SharedError:
     InputError
         Fewer than 2 n errors, or shapes that do not fit.
     """
-    N, n = errors.shape[0], errors.shape[-1]
+    N = errors.shape[0]
+    n = errors.shape[-1]
     if errors.shape != (N, n) or J.shape != (N, n, len(prior)) or S.shape != (N, n, n):
         raise InputError(f"errors, J, S: shapes {errors.shape}, {J.shape}, {S.shape} do not fit")
     if 2 * n > N:

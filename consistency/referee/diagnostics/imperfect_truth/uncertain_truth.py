@@ -18,7 +18,16 @@ from consistency.referee.diagnostics.questions.shape import weighted_chi_square_
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.answers import AXIS, BIAS, MAIN, SHARES, Settings, at_share, least_of_steps
+from consistency.referee.diagnostics.verdict.answers import (
+    AXIS,
+    BIAS,
+    MAIN,
+    SHARES,
+    Settings,
+    at_share,
+    faults_of,
+    least_of_steps,
+)
 from consistency.referee.diagnostics.verdict.parts import Answer, Equivalence, ErrorParts, Interval, TruthShare
 from consistency.referee.types import Array
 
@@ -113,12 +122,12 @@ class UncertainTruth:
     @cached_property
     def groups(self) -> Mapping[str, list[int]]:
         """All components (MAIN), and each group of the sample."""
-        return {MAIN: list(range(self.total.dof))} | dict(self.total.known_errors.groups)
+        return {MAIN: list(range(self.total.dof))} | dict(self.total.components)
 
     @cached_property
     def by_group(self) -> Mapping[str, Array]:
         """:meth:`eigenvalues` of each group, and of velocity."""
-        groups = {**self.groups, **self.total.known_errors.reported}
+        groups = {**self.groups, **self.total.reported}
         return {key: self.eigenvalues(index) for key, index in groups.items()}
 
     def share(self, group: str = MAIN) -> float:
@@ -147,7 +156,8 @@ class UncertainTruth:
         bias = self._bias()
         if self.contrasted:
             return dict(p_values) | bias
-        of_axes, of_all = [], float("nan")
+        of_axes = []
+        of_all = float("nan")
         for key, (above, below) in self.tails.items():
             p = above
             if not settings.one_sided:
@@ -190,19 +200,22 @@ class UncertainTruth:
 
     def _bias(self) -> dict[str, float]:
         """p values of a mean error: by the spread of the runs, and beyond what the truth allows."""
-        e, counted = self.total.known_errors, self.total.counted
+        whitened = self.total.whitened
+        assert whitened is not None
+        counted = self.total.counted
         runs: Array = np.asarray(counted.any(axis=1))
         steps: Array = np.asarray(counted.any(axis=0))
         if runs.sum() <= self.total.dof:
             return dict.fromkeys(BIAS, float("nan"))
-        error = np.where(counted[..., None], e.error, np.nan)
-        P, P_t = self._counted_entries(self.P), self._counted_entries(self.P_t)
-        spread = hotelling(mean_of_runs(e.whitened)[runs]).p_value
+        error = np.where(counted[..., None], self.total.error, np.nan)
+        P = self._counted_entries(self.P)
+        P_t = self._counted_entries(self.P_t)
+        spread = hotelling(mean_of_runs(whitened)[runs]).p_value
         mean, stated, of_truth = (mean_of_runs(M)[runs].mean(axis=0) for M in (error, P, P_t))
         allowed = self._allowed(mean, stated, of_truth, np.array(runs.sum()))
         p = {BIAS[0]: max(spread, float(allowed))}
         if len(steps) > 1:
-            _, spreads = t_squared(e.whitened[:, steps])
+            _, spreads = t_squared(whitened[:, steps])
             mean, stated, of_truth = (mean_of_runs(np.swapaxes(M, 0, 1))[steps] for M in (error, P, P_t))
             in_steps = self._allowed(mean, stated, of_truth, counted.sum(axis=0)[steps])
             p[BIAS[1]], _ = least_of_steps(np.maximum(spreads, in_steps))
@@ -239,7 +252,10 @@ class UncertainTruth:
 
     def of_estimate(self, parts: ErrorParts, answers: Sequence[Answer], settings: Settings) -> ErrorParts:
         """The parts with every ratio that of P."""
-        scale, location, axes, bias = parts.scale, parts.location, parts.axes, parts.bias
+        scale = parts.scale
+        location = parts.location
+        axes = parts.axes
+        bias = parts.bias
         assert scale is not None
         assert location is not None
         assert axes is not None
@@ -264,7 +280,7 @@ class UncertainTruth:
 
     def status(self, status: str, answers: Sequence[Answer], settings: Settings) -> str:
         """The status: where only bounds hold, by the side of what they found."""
-        faults = {answer.question for answer in answers if answer.found and not answer.tolerated}
+        faults = set(faults_of(answers))
         if not self.bounded or not faults & {MAIN, AXIS, *BIAS} or status == "heavy-tailed":
             return status
         if faults & set(BIAS):
@@ -297,12 +313,14 @@ class UncertainTruth:
     def _of_P(self, of_both: Interval, group: str) -> Interval:
         """Ratio of P from that of both covariances; with its widest interval where only bounds hold."""
         share = self.share(group)
-        low, high = of_both.low - share, of_both.high - share
+        low = of_both.low - share
+        high = of_both.high - share
         if self.bounded:
             k = self.by_group[group].shape[1]
             # of the truth, if all its errors are one
             most = share * float(distributions.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k
-            low, high = of_both.low - most, of_both.high
+            low = of_both.low - most
+            high = of_both.high
             if self.record.truth_shared:
                 low = max(np.sqrt(of_both.low) - np.sqrt(most), 0.0) ** 2
                 high = (np.sqrt(of_both.high) + np.sqrt(most)) ** 2
@@ -371,9 +389,11 @@ def contrasts(error: Array, P: Array) -> tuple[Array, Array]:
     """
     counted: Array = np.asarray(np.isfinite(error).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
     m: Array = np.cumsum(counted, axis=0) - counted
-    e, S = np.where(counted[..., None], error, 0.0), np.where(counted[..., None, None], P, 0.0)
+    e = np.where(counted[..., None], error, 0.0)
+    S = np.where(counted[..., None, None], P, 0.0)
     first: Array = np.asarray(m[..., None] == 0)
     many = np.maximum(m, 1)[..., None]
-    before, stated = (np.cumsum(e, axis=0) - e) / many, (np.cumsum(S, axis=0) - S) / many[..., None]
+    before = (np.cumsum(e, axis=0) - e) / many
+    stated = (np.cumsum(S, axis=0) - S) / many[..., None]
     kept = np.where(first | ~counted[..., None], np.nan, many / (many + 1.0))
     return (error - before) * np.sqrt(kept), (P + stated / many[..., None]) * kept[..., None]

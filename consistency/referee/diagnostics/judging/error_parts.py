@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.fault_location import Answers, any_found, from_step, location_of
+from consistency.referee.diagnostics.judging.fault_location import from_step, location_of
 from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
 from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import hotelling
@@ -34,14 +34,15 @@ from consistency.referee.diagnostics.verdict.answers import (
     STEP,
     Settings,
     at_share,
+    faults_of,
     with_tolerated,
 )
 from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
     Answer,
-    Axes,
     Bias,
     ByGroup,
+    ComponentRatios,
     Equivalence,
     ErrorParts,
     Group,
@@ -63,13 +64,14 @@ def error_parts(
     record: Record, sample: Sample, tests: Tests, given: Sequence[Answer], settings: Settings, shown: Equivalence
 ) -> ErrorParts:
     """All parts of the errors of a sample; those of NEES alone have no components."""
-    faults = {answer.question: answer for answer in given if not answer.tolerated}
+    faults = set(faults_of(given))
     band = _band_of_fault(sample, tests, faults, settings)
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown)
-    tails, by_group = tails_of(tests, record.run_numbers), by_group_of(record, sample, tests, given, settings)
-    if sample.errors is None:
+    tails = tails_of(tests, record.run_numbers)
+    by_group = by_group_of(record, sample, tests, given, settings)
+    if sample.whitened is None:
         return ErrorParts(scale, location, tails=tails, by_group=by_group)
     return ErrorParts(
         scale,
@@ -83,10 +85,9 @@ def error_parts(
     )
 
 
-def _band_of_fault(sample: Sample, tests: Tests, faults: Answers, settings: Settings) -> Band:
+def _band_of_fault(sample: Sample, tests: Tests, faults: set[str], settings: Settings) -> Band:
     """The band of the steps; where they were found by what Holm's correction left over, one that shows it."""
-    step = faults.get(STEP)
-    if step is None or not step.found or tests.band.outside.any():
+    if STEP not in faults or tests.band.outside.any():
         return tests.band
     rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
     return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
@@ -96,12 +97,14 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
     if settings.tolerance is None:
         return tuple(given)
-    R, steps, dof = settings.tolerated, sample.longest, sample.dof
+    R = settings.tolerated
+    steps = sample.longest
+    dof = sample.dof
     if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
         return tuple(given)
     tolerated = {MAIN}
-    if sample.errors is not None:
-        groups = sample.errors.groups.values()
+    if sample.whitened is not None:
+        groups = sample.components.values()
         if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
             tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
@@ -117,15 +120,18 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
 
 def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
     """Size of the errors; the inflation is that since the fault began, if it began late."""
-    dof, means = sample.dof, sample.means()
+    dof = sample.dof
+    means = sample.means()
     alive = sample.counted.sum(axis=0)
-    curve, band = anees(sample.nees), pointwise_band(alive, dof)
+    curve = anees(sample.nees)
+    band = pointwise_band(alive, dof)
     rate = SHARES[MAIN] * settings.false_alarm
     judged = alive > 0
     detectable = median_run = worst_run = share_inside = float("nan")
     if judged.any():
         detectable = detectable_ratio(dof, len(means), rate, two_sided=not settings.one_sided)
-        median_run, worst_run = float(np.median(means)) * dof, float(means.max()) * dof
+        median_run = float(np.median(means)) * dof
+        worst_run = float(means.max()) * dof
         inside = (curve >= band[:, 0]) & (curve <= band[:, 1])
         share_inside = float(inside[judged].mean())
     of_log = None
@@ -154,16 +160,17 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
     )
 
 
-def axes_of(sample: Sample, tests: Tests, location: Location) -> Axes:
+def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
     """Inflation of each component and group, and of velocity, since the fault began."""
-    errors = sample.known_errors
-    late, confidence = from_step(location.since), 1.0 - (1.0 - CONFIDENCE) / len(errors.groups)
+    late = from_step(location.since)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
+    reported = sample.reported
     inflation = {}
-    for key, index in errors.reported.items():
+    for key, index in reported.items():
         inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
     if tests.largest is None:
-        return Axes(errors.names, errors.reported, inflation)
-    return Axes(errors.names, errors.reported, inflation, tests.largest.ratio, tests.largest.direction)
+        return ComponentRatios(sample.names, reported, inflation)
+    return ComponentRatios(sample.names, reported, inflation, tests.largest.ratio, tests.largest.direction)
 
 
 def by_group_of(
@@ -179,20 +186,22 @@ def by_group_of(
         return None
     found = [sample.in_group(number) for number in range(len(groups.names))]
     there = sum(len(one.means) > 0 for one in found)
-    answer = next((answer for answer in given if answer.question == GROUP), None)
-    is_found = answer is not None and answer.found and not answer.tolerated
+    is_asked = any(answer.question == GROUP for answer in given)
+    is_found = GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
     from consistency.referee.diagnostics.records.groups import spans_of
 
-    by_group, spans = [], None if groups.edges is None else spans_of(groups.edges)
+    by_group = []
+    spans = None if groups.edges is None else spans_of(groups.edges)
     for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
         if not len(one.means):
             continue
         shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
-        p_value, status = float("nan"), ""
-        if answer is not None:
+        p_value = float("nan")
+        status = ""
+        if is_asked:
             p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
             is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
@@ -210,32 +219,32 @@ def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
     return "consistent" if shown.shown else "undecided"
 
 
-def bias_of(sample: Sample, step: int | None, location: Location, answers: Answers) -> Bias:
+def bias_of(sample: Sample, step: int | None, location: Location, faults: set[str]) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    errors, late = sample.known_errors, from_step(location.since)
+    late = from_step(location.since)
 
     def means(error: Array, covariance: Array, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
 
-    of_runs = by_runs(means, errors.error[:, late], errors.covariance[:, late], sample.counted[:, late])
+    of_runs = by_runs(means, sample.error[:, late], sample.covariance[:, late], sample.counted[:, late])
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
     if len(of_runs) > sample.dof:
         test = hotelling(of_runs, CONFIDENCE)
-        for i, axis in enumerate(errors.names):
+        for i, axis in enumerate(sample.names):
             by_axis[axis] = Interval(test.mean[i], *test.interval[i])
-    if not any_found(answers, BIAS):
+    if not faults & set(BIAS):
         return Bias(by_axis, step, None, None, None)
     without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
     if step is None:
         return Bias(by_axis, step, None, None, without)
-    at = standardise(errors.error[:, step - 1], errors.covariance[:, step - 1])[sample.counted[:, step - 1]]
+    at = standardise(sample.error[:, step - 1], sample.covariance[:, step - 1])[sample.counted[:, step - 1]]
     mean = at.mean(axis=0)
     chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(TINIEST)))  # what stands out most
-    return Bias(by_axis, step, errors.names[chief], float(mean[chief]), without)
+    return Bias(by_axis, step, sample.names[chief], float(mean[chief]), without)
 
 
-def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float) -> Shape | None:
+def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found.
 
     A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others. The status
@@ -243,24 +252,24 @@ def shape_of(sample: Sample, tests: Tests, answers: Answers, false_alarm: float)
     """
     if tests.matrix is None or sample.dof == 1:
         return None
-    errors, here = sample.known_errors, slice(None)
-    if tests.shape_step is not None and not any_found(answers, ("shape",)):
+    here = slice(None)
+    if tests.shape_step is not None and "shape" not in faults:
         here = slice(tests.shape_step - 1, tests.shape_step)
     counted = sample.counted[:, here]
     if not counted.any():
         return Shape(tests.matrix, tests.shape_step, None, float("nan"), float("nan"))
-    gap, stated = _correlations(errors.error[:, here], errors.covariance[:, here], counted)
+    gap, stated = _correlations(sample.error[:, here], sample.covariance[:, here], counted)
     shown = np.zeros(gap.shape, bool)
-    if any_found(answers, (*SCALE, *SHAPE)):
+    if faults & {*SCALE, *SHAPE}:
         shown = _shown_pairs(sample, here, NAMING * false_alarm)
     clear = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
     actual = stated + gap
     opposite = (actual * stated < 0.0) & (np.abs(actual) > clear) & (np.abs(stated) > VISIBLE)
-    opposite &= any_found(answers, SHAPE)
+    opposite &= bool(faults & set(SHAPE))
     farthest = pair = _largest(gap)
     if shown.any():
         pair = _largest(np.where(shown, gap, 0.0))
-    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in errors.names)
+    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in sample.names)
     return Shape(
         matrix=tests.matrix,
         step=tests.shape_step,
@@ -281,23 +290,27 @@ def _shown_pairs(sample: Sample, here: slice, false_alarm: float) -> Array:
     of its own, a pair is shown with probability ``false_alarm`` at most (Bonferroni over the pairs). Simulated at 5 %:
     some pair in 4.2 % of 9,600 data sets of 3, 9 and 15 axes, 20 and 100 runs, steps that depend by 0 to 0.99.
     """
-    errors, counted = sample.known_errors, sample.counted
+    counted = sample.counted
     pairs = sample.dof * (sample.dof - 1) // 2
     found = [(slice(None), pairs)]
     if here != slice(None):
         found = [(slice(None), 2 * pairs), (here, 2 * pairs * int(counted.any(axis=0).sum()))]
     shown = np.zeros((sample.dof, sample.dof), bool)
     for steps, looks in found:
-        p_values = pair_p_values(errors.error[:, steps], errors.covariance[:, steps], counted[:, steps])
+        p_values = pair_p_values(sample.error[:, steps], sample.covariance[:, steps], counted[:, steps])
         shown |= p_values * looks <= false_alarm
     return shown
 
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    run, step, distance = -1, 0, float("nan")
+    run = -1
+    step = 0
+    distance = float("nan")
     if tests.outlier is not None:
-        run, step, distance = tests.outlier.run, tests.outlier.step + 1, tests.outlier.distance
+        run = tests.outlier.run
+        step = tests.outlier.step + 1
+        distance = tests.outlier.distance
     if run >= 0:
         run = int(run_numbers[run])
     return Tails(run, step, distance, tests.pit.values, tests.pit.half_width)
@@ -305,21 +318,21 @@ def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
 
 def accuracy_of(sample: Sample) -> Accuracy:
     """Coverage, RMSE and the noncredibility index."""
-    errors, counted = sample.known_errors, sample.counted
-    index, inclination = noncredibility(errors.error, sample.nees)
-    inside, interval = coverage_interval(errors.error, errors.covariance, counted=counted)
+    counted = sample.counted
+    index, inclination = noncredibility(sample.error, sample.nees)
+    inside, interval = coverage_interval(sample.error, sample.covariance, counted=counted)
 
     def rmse_of(members: set[str]) -> float:
-        columns = [i for i, axis in enumerate(errors.names) if axis in members]
+        columns = [i for i, axis in enumerate(sample.names) if axis in members]
         if not columns:
             return float("nan")
-        return rmse(errors.error, columns, counted)
+        return rmse(sample.error, columns, counted)
 
     return Accuracy(
-        coverage=coverage(errors.error, errors.covariance, counted=counted),
+        coverage=coverage(sample.error, sample.covariance, counted=counted),
         coverage_one_step=inside,
         coverage_interval=interval,
-        rmse=np.array([rmse(errors.error, [i], counted) for i in range(sample.dof)]),
+        rmse=np.array([rmse(sample.error, [i], counted) for i in range(sample.dof)]),
         rmse_position=rmse_of(POSITION),
         rmse_heading=rmse_of(ATTITUDE),
         nci=_mean_of_known(index),
@@ -341,8 +354,11 @@ def _largest(matrix: Array) -> tuple[int, int]:
 
 def _correlations(error: Array, covariance: Array, counted: Array) -> tuple[Array, Array]:
     """Correlations of the errors less those stated, and those stated, averaged over steps; (n, n) both."""
-    n, count = error.shape[-1], int(counted.sum())
-    mean, stated, second = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
+    n = error.shape[-1]
+    count = int(counted.sum())
+    mean = np.zeros(n)
+    stated = np.zeros((n, n))
+    second = np.zeros((n, n))
     parts = list(block_slices(*counted.shape))
     for here in parts:
         mean += standardise(error[here], covariance[here])[counted[here]].sum(axis=0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
@@ -12,20 +10,12 @@ from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP, Settings
-from consistency.referee.diagnostics.verdict.parts import Answer, Location, Until
+from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP
+from consistency.referee.diagnostics.verdict.parts import Location, Until
 from consistency.referee.types import Array, Indices
 
-DETECT = Settings().factor
 FEWEST = 8  # runs; with fewer the axes are not told apart
 SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
-
-Answers = Mapping[str, Answer]
-
-
-def any_found(answers: Answers, questions: Collection[str]) -> bool:
-    """Whether one of the questions found a fault."""
-    return any(question in answers and answers[question].found for question in questions)
 
 
 def from_step(since: int | None) -> slice:
@@ -35,25 +25,29 @@ def from_step(since: int | None) -> slice:
     return slice(since - 1, None)
 
 
-def location_of(sample: Sample, band: Band, answers: Answers, ordered: bool = True, detect: float = DETECT) -> Location:
+def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, detect: float) -> Location:
     """Steps outside the band, beginning or end of the fault, and its axes.
 
-    Without ``ordered`` steps a fault has no beginning or end. ``detect`` is that of the settings.
+    Parameters
+    ----------
+    faults : questions that found one
+    ordered : steps follow each other; otherwise a fault has no beginning or end
+    detect : that of the settings, as a factor above 1
     """
     first_outside = first_step = since = subset = last = None
     lasting = False
     if band.outside.any():
         first = int(np.argmax(band.outside))
         first_outside = first + 1
-        if any_found(answers, (STEP,)):
+        if STEP in faults:
             first_step = first_outside
             if ordered:
                 lasting = _is_lasting(sample, band, first)
             if lasting and _absent_before(sample, first, band.above[first]):
                 since = first_step
-    if sample.errors is not None and any_found(answers, SCALE):
-        subset = chief_axes(sample, from_step(since), any_found(answers, (MAIN,)))
-    if ordered and any_found(answers, (*SCALE, *BIAS)):
+    if sample.whitened is not None and faults & set(SCALE):
+        subset = chief_axes(sample, from_step(since), MAIN in faults)
+    if ordered and faults & {*SCALE, *BIAS}:
         last = until(sample, band, detect)
     return Location(
         simultaneous=np.stack([band.low, band.high], axis=-1),
@@ -83,12 +77,15 @@ def _absent_before(sample: Sample, first: int, above: bool) -> bool:
 
     One-sided Student's t of the log mean before, with the standard error of the runs.
     """
-    early, late = sample.means(slice(0, first)), sample.means(slice(first, None))
+    early = sample.means(slice(0, first))
+    late = sample.means(slice(first, None))
     if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
         return False
-    log_early, log_late = np.log(early.mean()), np.log(late.mean())
+    log_early = np.log(early.mean())
+    log_late = np.log(late.mean())
     if not above:
-        log_early, log_late = -log_early, -log_late
+        log_early = -log_early
+        log_late = -log_late
     error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
     upper = log_early + float(distributions.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
     return bool(upper < 0.5 * log_late)
@@ -111,9 +108,11 @@ def until(sample: Sample, band: Band, detect: float) -> Until | None:
     for end, a, b in zip(ends, early.T, late.T, strict=True):
         if not a.mean() > 0 or not b.mean() > 0:
             continue
-        sign, outside = -1.0, band.below
+        sign = -1.0
+        outside = band.below
         if a.mean() > 1.0:
-            sign, outside = 1.0, band.above
+            sign = 1.0
+            outside = band.above
         left = sign * (np.log(b.mean()) - 0.5 * np.log(a.mean()))
         error = float((b / b.mean() - 0.5 * a / a.mean()).std(ddof=1))
         if left + bar * error >= 0.0 or outside[end:].any():
@@ -128,14 +127,16 @@ def _splits(sample: Sample) -> tuple[Indices, Array, Array]:
     """Ends (K,) of the first steps, and mean NEES over dof before and after each, (runs, K), of runs with both."""
     judged = np.flatnonzero(sample.counted.any(axis=0))
     ends = judged[2 ** np.arange((len(judged) // 2).bit_length()) - 1] + 1
-    means, counts = [], []
+    means = []
+    counts = []
     for piece in np.split(sample.nees, ends, axis=1):
         of_runs, steps = run_means(piece)
         means.append(of_runs)
         counts.append(steps)
     count = np.stack(counts, axis=-1)
     sums = np.where(count > 0, np.stack(means, axis=-1) * count, 0.0)
-    sum_before, count_before = np.cumsum(sums, axis=1)[:, :-1], np.cumsum(count, axis=1)[:, :-1]
+    sum_before = np.cumsum(sums, axis=1)[:, :-1]
+    count_before = np.cumsum(count, axis=1)[:, :-1]
     sum_after = sums.sum(axis=1)[:, None] - sum_before
     count_after = count.sum(axis=1)[:, None] - count_before
     both = (count_before > 0).all(axis=1) & (count[:, -1] > 0)
@@ -152,7 +153,8 @@ def chief_axes(sample: Sample, steps: slice, as_whole: bool) -> str | None:
     Bonferroni over axes. None where no axis stands out, or all do, or with fewer than 8 runs. Where the whole is at
     fault (``as_whole``), an axis that errs in the other direction does not carry it.
     """
-    names, n = sample.known_errors.names, sample.dof
+    names = sample.names
+    n = sample.dof
     if n == 1 or np.isfinite(sample.nees[:, steps]).any(axis=1).sum() < FEWEST:
         return None
     Y = np.stack([sample.group_means([j], steps) for j in range(n)], axis=-1)

@@ -61,8 +61,8 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     p = {MAIN: scale}
     axes: dict[str, MeanTest] = {}
     largest = outlier = matrix = bias_step = shape_step = None
-    if sample.errors is not None:
-        whitened = sample.errors.whitened
+    if sample.whitened is not None:
+        whitened = sample.whitened
         in_steps = step_moments(whitened)
         axes = axis_tests(sample)
         p[AXIS] = float("nan")
@@ -103,7 +103,7 @@ def axis_tests(sample: Sample) -> dict[str, MeanTest]:
     """Test of the scale of each component and group by itself."""
     return {
         key: scale_test(sample.group_means(index), len(index), sample.longest)
-        for key, index in sample.known_errors.groups.items()
+        for key, index in sample.components.items()
     }
 
 

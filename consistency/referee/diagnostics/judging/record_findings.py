@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.judging.status import (
     status_by_errors,
     status_by_innovations,
     status_without_fault,
+    withheld,
 )
 from consistency.referee.diagnostics.questions.bias import t_squared
 from consistency.referee.diagnostics.questions.equivalence import (
@@ -34,6 +35,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     MAIN,
     Settings,
     answers,
+    faults_of,
     least_of_steps,
     with_tolerated,
 )
@@ -73,11 +75,18 @@ class Inspection:
 
 
 def findings_of(
-    record: Record, settings: Settings, inspection: Inspection | None = None, truth: UncertainTruth | None = None
+    record: Record,
+    settings: Settings,
+    inspection: Inspection | None = None,
+    truth: UncertainTruth | None = None,
+    unshown: str = "",
 ) -> Findings:
     """Test the errors and innovations of a record, and nothing beside them.
 
-    With a ``truth`` that is uncertain the record is :attr:`UncertainTruth.evidence`.
+    Parameters
+    ----------
+    truth : where it is uncertain; the record is then :attr:`UncertainTruth.evidence`
+    unshown : why nothing can be shown, so that no question of the errors is asked and nothing is decided
     """
     runs, steps = runs_and_steps(record)
     both_sides = settings
@@ -87,22 +96,26 @@ def findings_of(
     joint = _joint(record, settings)
     if joint is not None:
         p_values |= joint.p_values
-    sample, tests = sample_of(record, settings), None
+    sample = sample_of(record, settings)
+    tests = None
     if sample is not None:
-        scale = None
+        scale_p_value = None
         if inspection is not None:
-            scale = inspection.scale
-        tests = run_tests(sample, settings, p_values, scale)
+            scale_p_value = inspection.scale
+        tests = run_tests(sample, settings, p_values, scale_p_value)
         asked = tests.p_values
         if truth is not None:
             asked = truth.p_values(asked, settings)
-        p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
+        if not unshown:
+            p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
     if inspection is not None:
         p_values = inspection.corrected(p_values)
     given = tuple(answers(p_values, settings.false_alarm).values())
     given = with_tolerated(given, _tolerated(joint, innovations, settings))
 
-    parts, lost, ends = ErrorParts(), None, None
+    parts = ErrorParts()
+    lost = None
+    ends = None
     impossible: list[tuple[int, int]] = []
     left_out: list[int] = []
     if sample is not None and tests is not None:
@@ -112,11 +125,12 @@ def findings_of(
         lost = lost_of(record, sample.nees, sample.dof, settings, any_time=inspection is not None)
         if record.landmarks is None:
             ends = _early_ends(sample)
-        if sample.errors is not None:
-            impossible, left_out = _impossible(record, sample), _left_out_steps(record, sample)
+        if sample.whitened is not None:
+            impossible = _impossible(record, sample)
+            left_out = _left_out_steps(record, sample)
     broken = bool(record.failures or impossible or (joint is not None and joint.score.not_definite))
 
-    faults = {answer.question for answer in given if answer.found and not answer.tolerated}
+    faults = set(faults_of(given))
     if nothing_judged(parts.scale, innovations):
         status = "failed"
     elif not faults:
@@ -127,8 +141,13 @@ def findings_of(
         status = status_by_errors(given, settings, sample, tests, joint, parts)
     share = None
     if truth is not None:
-        share, status = truth.truth_share(), truth.status(status, given, settings)
+        share = truth.truth_share()
+        status = truth.status(status, given, settings)
         parts = _parts_of_estimate(truth, parts, given, settings)
+    unshown, status, scale = withheld(unshown, status, parts.scale)
+    later = status == "consistent" and inspection is not None and inspection.spent is None
+    if later:
+        status = "undecided"
     return Findings(
         filter=record.name,
         status=status,
@@ -139,7 +158,7 @@ def findings_of(
         failures=record.failures,
         impossible=tuple(impossible),
         left_out_steps=tuple(left_out),
-        **parts._asdict(),
+        **parts._replace(scale=scale)._asdict(),
         innovations=innovations,
         landmarks=record.landmarks,
         joint=None if joint is None else joint.score,
@@ -150,6 +169,8 @@ def findings_of(
         ends=ends,
         skipped=record.skipped,
         truth=share,
+        unshown=unshown,
+        later=later,
     )
 
 
@@ -172,7 +193,8 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
     if found is None:
         return None, {}
     nis, dof = found
-    test, interval = nis_test(nis, dof), UNKNOWN_ENDS
+    test = nis_test(nis, dof)
+    interval = UNKNOWN_ENDS
     if test.dof:
         interval = chi2_mean_interval(test.dof, CONFIDENCE)
     if record.innovations is not None and record.innovation_covariances is not None:
@@ -262,10 +284,13 @@ def _parts_of_estimate(
     assert parts.bias is not None
     assert parts.accuracy is not None
     assert parts.location is not None
-    size, clearest, whitened = accuracy_of(truth.total), None, truth.total.known_errors.whitened
+    size = accuracy_of(truth.total)
+    clearest = None
+    whitened = truth.total.whitened
+    assert whitened is not None
     if whitened.shape[1] > 1:
         _, clearest = least_of_steps(t_squared(whitened)[1])  # whatever the truth allows
-    mean = bias_of(truth.total, clearest, parts.location, {answer.question: answer for answer in given})
+    mean = bias_of(truth.total, clearest, parts.location, set(faults_of(given)))
     return parts._replace(
         bias=replace(mean, inflation_without=parts.bias.inflation_without),
         accuracy=replace(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from consistency.referee.diagnostics.judging.record_findings import findings_of
-from consistency.referee.diagnostics.judging.status import few_lost
+from consistency.referee.diagnostics.judging.status import few_lost, withheld
 from consistency.referee.diagnostics.questions.equivalence import worst
 from consistency.referee.diagnostics.questions.lost_runs import lost_of
 from consistency.referee.diagnostics.questions.sample import names_of
@@ -17,13 +17,13 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.answers import SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Answer, Lost, Scale
-from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings, Verdict
+from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings
 from consistency.referee.types import Array
 
 INNOVATIONS = "innovations"
 
 
-def findings_of_parts(record: Record, settings: Settings, verdict_of: Callable[[Findings], Verdict]) -> Findings:
+def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> Findings:
     """Judge each part of a record by itself; see ``Record.parts``.
 
     A part is a component, or several whose cross terms are stated. Of two parts only the marginal covariances are
@@ -35,28 +35,32 @@ def findings_of_parts(record: Record, settings: Settings, verdict_of: Callable[[
 
     Parameters
     ----------
-    verdict_of : puts the findings of a part into words
+    unshown : why nothing can be shown, as for :func:`findings_of`
 
     Raises
     ------
     ValueError
         As :func:`consistency.diagnostics.judge`.
     """
-    found = _by_holm(_records_of_parts(record), settings)
-    parts = {name: verdict_of(part) for name, part in found.items()}
+    if unshown:
+        record = replace(record, unavailable=tuple(SHARES))
+    parts = _by_holm(_records_of_parts(record), settings)
     whole = findings_of(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
     nees = _nees_over_n(record)
     lost = lost_of(record, nees, 1, settings)  # a mean of chi-square(1), however they depend on each other
-    innovations, accuracy, scale = whole.innovations, whole.accuracy, whole.scale
+    innovations = whole.innovations
+    accuracy = whole.accuracy
+    scale = whole.scale
     if INNOVATIONS in parts:
         innovations = parts[INNOVATIONS].innovations
     if accuracy is not None:
         accuracy = replace(accuracy, nci=float("nan"), inclination=float("nan"))
     if scale is not None:
-        scale = _scale_of_whole(scale, [part.scale for part in parts.values() if part.scale is not None], record, nees)
+        scale = _scale_of_whole(scale, parts, record, nees)
+    unshown, status, scale = withheld(unshown, _status(list(parts.values()), lost, settings), scale)
     return replace(
         whole,
-        status=_status(list(parts.values()), lost, settings),
+        status=status,
         settings=settings,
         answers=tuple(_answers(parts, settings)),
         scale=scale,
@@ -68,6 +72,7 @@ def findings_of_parts(record: Record, settings: Settings, verdict_of: Callable[[
         tails=None,
         accuracy=accuracy,
         innovations=innovations,
+        unshown=unshown,
     )
 
 
@@ -78,7 +83,8 @@ def _records_of_parts(record: Record) -> dict[str, Record]:
     covariance = np.asarray(record.covariance, float)
     records = {}
     for index in record.parts:
-        some, axes = list(index), tuple(names[i] for i in index)
+        some = list(index)
+        axes = tuple(names[i] for i in index)
         records[", ".join(axes)] = replace(
             record,
             error=record.error[..., some],
@@ -123,8 +129,9 @@ def _nees_over_n(record: Record) -> Array:
     return np.where(counted, nees, np.nan)
 
 
-def _scale_of_whole(whole: Scale, scales: Sequence[Scale], record: Record, nees: Array) -> Scale:
+def _scale_of_whole(whole: Scale, parts: Mapping[str, Findings], record: Record, nees: Array) -> Scale:
     """The size of all errors, with what is known of it whatever the correlations."""
+    scales = [part.scale for part in parts.values() if part.scale is not None]
     means, counts = run_means(nees)
     inflation = whole.inflation
     if counts.astype(bool).sum() < FEW:  # the errors of all parts may be the same
@@ -141,14 +148,15 @@ def _scale_of_whole(whole: Scale, scales: Sequence[Scale], record: Record, nees:
     )
 
 
-def _answers(parts: Mapping[str, Verdict], settings: Settings) -> list[Answer]:
+def _answers(parts: Mapping[str, Findings], settings: Settings) -> list[Answer]:
     """Answers of all parts, corrected for their number."""
     given = []
     for name, part in parts.items():
         among = settings.false_alarm / part.settings.false_alarm  # parts that shared the rate with it
         for answer in part.answers:
             adjusted = min(1.0, answer.adjusted * among)
-            question, share = f"{answer.question} of {name}", answer.share / len(parts)
+            question = f"{answer.question} of {name}"
+            share = answer.share / len(parts)
             given.append(replace(answer, question=question, share=share, adjusted=adjusted))
     return given
 

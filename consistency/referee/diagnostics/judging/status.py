@@ -25,6 +25,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     Settings,
     answers,
     at_share,
+    faults_of,
 )
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
@@ -67,6 +68,13 @@ def status_without_fault(
     return "undecided"
 
 
+def withheld(unshown: str, status: str, scale: Scale | None) -> tuple[str, str, Scale | None]:
+    """Reason, status and scale where nothing can be shown for that reason: undecided, unless a run failed."""
+    if not unshown or scale is None or status == "failed":
+        return "", status, scale
+    return unshown, "undecided", scale.not_shown
+
+
 def few_lost(lost: Lost | None, settings: Settings) -> bool:
     """Whether the share of lost runs is shown to be what was asked for, if it was."""
     if settings.lost is None:
@@ -78,7 +86,8 @@ def status_by_innovations(faults: Collection[str], innovations: Innovations | No
     """The status where innovations alone are at fault: by the rest of them where outliers are among them."""
     if "innovation scale" not in faults or innovations is None:
         return "inconsistent"
-    far, rate = innovations.outliers, settings.false_alarm
+    far = innovations.outliers
+    rate = settings.false_alarm
     if far is None or far.rest.above <= rate:
         return _side(innovations.ratio)
     if far.rest.below <= rate and not settings.one_sided:
@@ -95,7 +104,7 @@ def status_by_errors(
     parts: ErrorParts,
 ) -> str:
     """The status where a question about errors found a fault. It may overwrite the arrays of the ``sample``."""
-    faults = {answer.question for answer in given if answer.found and not answer.tolerated}
+    faults = set(faults_of(given))
     if faults & set(BIAS):
         sample, tests, rest = _without_bias(given, settings, sample)
         status = "biased"
@@ -123,7 +132,9 @@ def deciding_axis(found: Findings) -> tuple[str, Interval] | None:
     It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction, or looks
     right: its ratio lies in [1 / detect, detect], and the interval of the axis outside.
     """
-    axis, factor, faults = clear(found.worst_axis), found.settings.factor, found.faults
+    axis = clear(found.worst_axis)
+    factor = found.settings.factor
+    faults = found.faults
     if found.parts:
         of_parts = {question for part in found.parts.values() for question in part.faults}
         if not of_parts & set(SCALE):
@@ -190,7 +201,7 @@ def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, test
     if STEP in faults and not heavy:
         return _status_of_sides({_status_of_steps(settings, faults, sample, tests), *of_groups})
     if AXIS in faults or DIRECTION in faults:
-        if sample.errors is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
+        if sample.whitened is not None and (DIRECTION in faults or _robust_axis(sample, tests, settings)):
             return _status_of_sides({_status_of_axes(settings, tests), *of_groups})
         heavy = True
     if GROUP in faults and not heavy:
@@ -208,7 +219,8 @@ def _status_of_steps(settings: Settings, faults: set[str], sample: Sample, tests
         return "inconsistent"
     curve = anees(sample.nees)
     with np.errstate(divide="ignore", invalid="ignore"):
-        above, below = np.nanmax(curve / tests.band.high), np.nanmax(tests.band.low / curve)
+        above = np.nanmax(curve / tests.band.high)
+        below = np.nanmax(tests.band.low / curve)
     if above >= below:
         return "overconfident"
     return "conservative"
@@ -234,7 +246,7 @@ def _robust(
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
-    groups = sample.known_errors.groups
+    groups = sample.components
     for key, test in tests.axes.items():
         found = sided_p_value(test, settings) * len(groups) <= settings.false_alarm
         if found and _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups)):
@@ -278,11 +290,12 @@ def _contradicted(settings: Settings, sample: Sample, tests: Tests) -> bool:
     Any does where the whole is too large, because nothing is too small in a conservative covariance. Where it is too
     small, one that is farther from 1 than the whole, or all together, so that correlations make the whole too small.
     """
-    if settings.one_sided or sample.errors is None:
+    if settings.one_sided or sample.whitened is None:
         return False
     whole = float(np.log(max(tests.main.ratio, TINY)))
-    ratios, wrong = [], []
-    for axis in sample.errors.names:
+    ratios = []
+    wrong = []
+    for axis in sample.names:
         test = tests.axes[axis]
         ratios.append(test.ratio)
         if test.p_value * len(tests.axes) <= settings.false_alarm:

@@ -98,11 +98,14 @@ def joint_test(
     given = ~np.isnan(total) & (joint.dof > 0)
     kept = given & np.isfinite(total)
     numbers = np.arange(len(total)) if run_numbers is None else run_numbers
-    q, d = total[kept], joint.dof[kept] + POSE
-    Q, D = float(q.sum()), int(d.sum())
+    q = total[kept]
+    d = joint.dof[kept] + POSE
+    Q = float(q.sum())
+    D = int(d.sum())
     p_values = dict.fromkeys((JOINT, JOINT_DISTRIBUTION), float("nan"))
     if len(q):
-        above, below = float(distributions.chi2.sf(Q, D)), float(distributions.chi2.cdf(Q, D))
+        above = float(distributions.chi2.sf(Q, D))
+        below = float(distributions.chi2.cdf(Q, D))
         p_values[JOINT] = above
         if not settings.one_sided:
             p_values[JOINT] = min(1.0, 2.0 * min(above, below))
@@ -129,6 +132,7 @@ def _chief(joint: JointNees, labels: Indices | None) -> tuple[int, ...]:
     if parts is None or labels is None or not len(labels):
         return ()
     here = np.isfinite(parts)
-    total, dof = np.where(here, parts, 0.0).sum(axis=0), np.maximum(joint.width * here.sum(axis=0), 1)
+    total = np.where(here, parts, 0.0).sum(axis=0)
+    dof = np.maximum(joint.width * here.sum(axis=0), 1)
     p = 2.0 * np.minimum(distributions.chi2.sf(total, dof), distributions.chi2.cdf(total, dof)) * len(labels)
     return tuple(int(labels[j]) for j in np.argsort(p, kind="stable") if p[j] <= SURE and here[:, j].any())

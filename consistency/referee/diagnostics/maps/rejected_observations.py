@@ -33,10 +33,12 @@ def clustered_share(count: Array, size: Array, confidence: float = CONFIDENCE) -
     ratio of quantiles t(N - 1) / t(draws - 1). The design effect is taken as 1 at least. With one cluster it cannot be
     known, and with none of what is shared out nothing can: then the interval is [0, 1].
     """
-    count, size = np.asarray(count, float), np.asarray(size, float)
+    count = np.asarray(count, float)
+    size = np.asarray(size, float)
     used = size > 0
     count, size, draws = count[used], size[used], float(size.sum())
-    clusters, tail = len(size), 0.5 * (1.0 - confidence)
+    clusters = len(size)
+    tail = 0.5 * (1.0 - confidence)
     if draws == 0.0:
         return Interval(np.nan, 0.0, 1.0)
     share = float(count.sum() / draws)

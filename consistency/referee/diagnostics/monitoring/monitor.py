@@ -54,7 +54,8 @@ class Alarm:
     rest: float = math.nan  # where the NIS of this step is an outlier: NIS over degrees of freedom of all before
 
     def __str__(self) -> str:
-        size, others = f"x{self.scale:.3g}", ""
+        size = f"x{self.scale:.3g}"
+        others = ""
         if math.isinf(self.scale):
             size = "larger than a gate lets see"
         if self.rest > 0:
@@ -197,7 +198,10 @@ class Monitor:
             raise ValueError(f"tolerance must be 1 or more, got {tolerance}")
         if mission is not None and not (1 <= mission < math.inf and mission == int(mission)):
             raise ValueError(f"mission must be a whole number of 1 or more, got {mission}")
-        self.false_alarm, self.tolerance, self.gate, self.mission = false_alarm, tolerance, gate, mission
+        self.false_alarm = false_alarm
+        self.tolerance = tolerance
+        self.gate = gate
+        self.mission = mission
         self._rest = rest_after_rejection(gate)
         self._bets: dict[int, Bet] = {}
         self.reset()
@@ -208,10 +212,12 @@ class Monitor:
         self.steps = self.measurements = self.rejections = self.innovations = 0
         self.evidence = self.largest = 1.0
         self.alarm: Alarm | None = None
-        self._nis, self._dof = 0.0, 0
+        self._nis = 0.0
+        self._dof = 0
         self._unspent = 1.0  # 1 - (p_1 + ... + p_t)
         self._skip = 0  # accepted innovations still not to be judged
-        self._R, self._cusum = [0.0] * count, [0.0] * count
+        self._R = [0.0] * count
+        self._cusum = [0.0] * count
         self._resets = [START] * count
 
     def update(self, nis: float | None, dof: int) -> Alarm | None:
@@ -231,7 +237,8 @@ class Monitor:
             ``nis`` is negative or infinite, or ``dof`` not a whole number of 0 or more; nothing is counted then.
         """
         if isinstance(nis, np.ma.core.MaskedConstant):
-            nis, dof = None, 0
+            nis = None
+            dof = 0
         if not (0 <= dof < math.inf and dof == int(dof)):
             raise ValueError(f"dof must be a whole number of 0 or more, got {dof}")
         value = math.nan
@@ -261,7 +268,8 @@ class Monitor:
             return None
         best = max(range(len(self._R)), key=self._R.__getitem__)
         reset = self._resets[best]
-        direction, rest = "conservative", math.nan
+        direction = "conservative"
+        rest = math.nan
         if best < len(RATIOS):
             direction = "overconfident"
         if value > bet.far and self._dof > dof:
@@ -297,7 +305,9 @@ class Monitor:
         self._dof += dof
         share = start_share(self.innovations, self.mission)
         self._unspent = max(self._unspent - share, 0.0)
-        R, cusum, here = self._R, self._cusum, _Reset(self.steps + 1, self._nis, self._dof, self.innovations)
+        R = self._R
+        cusum = self._cusum
+        here = _Reset(self.steps + 1, self._nis, self._dof, self.innovations)
         total = 0.0
         for i, (constant, slope) in enumerate(bet.terms):
             log_ratio = constant + slope * nis

@@ -26,7 +26,8 @@ def log_chi2_cdf(x: float, dof: float) -> float:
     value = float(special.gammainc(dof / 2, x / 2))
     if value > TINY:
         return math.log(value)
-    a, half = dof / 2, x / 2
+    a = dof / 2
+    half = x / 2
     series = float(special.hyp1f1(1.0, a + 1.0, half))
     return a * math.log(half) - half - math.lgamma(a + 1.0) + math.log(series)
 

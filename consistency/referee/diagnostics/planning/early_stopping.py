@@ -42,7 +42,9 @@ class Design:
 
     def inspections(self) -> Iterator[tuple[int, float | None]]:
         """Numbers of runs at which to look, and the share of each look; None where only the scale is tested."""
-        runs, j, last = FIRST, 0, self.max_runs
+        runs = FIRST
+        j = 0
+        last = self.max_runs
         while True:
             spent = 1.0 / ((j + 1) * (j + 2))
             if last is not None and runs >= last:
@@ -54,7 +56,8 @@ class Design:
                 if last is not None and between >= last:
                     break
                 yield between, None
-            runs, j = 2 * runs, j + 1
+            runs = 2 * runs
+            j = j + 1
 
 
 def sequential_design(

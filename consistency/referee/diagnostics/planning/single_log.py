@@ -50,7 +50,8 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     steps = len(values)
     if steps < LONG * tau:
         return None
-    ratio, spread = float(values.mean()), float(values.var(ddof=1))
+    ratio = float(values.mean())
+    spread = float(values.var(ddof=1))
     fourth = float(np.mean((values - ratio) ** 4)) / spread**2
     doubt = 2.0 * (2.0 * reach + 1.0) / steps + max(fourth - 1.0, 0.0) * tau / steps  # variance of log(tau s^2)
     log_nu = np.log(2.0 * ratio**2 * steps / (spread * tau)) - np.sqrt(doubt)
@@ -127,7 +128,9 @@ def memory_of(whitened: Array) -> ErrorMemory:
     if len(w) < 2:
         return ErrorMemory(len(whitened), np.inf, np.inf)
     sizes = np.square(w).sum(axis=1)
-    longest, upper, z = 0.0, 0.0, float(special.ndtri(CONFIDENCE))
+    longest = 0.0
+    upper = 0.0
+    z = float(special.ndtri(CONFIDENCE))
     for series in (*w.T, sizes - sizes.mean()):
         time, reach = correlation_time(series)
         longest = max(longest, time)
@@ -176,7 +179,8 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         for name, array in arrays_of(record).items()
         if name not in ("covariance", "times", "truth_covariance")
     }
-    clock, times = record.t, None
+    clock = record.t
+    times = None
     if record.times is not None:
         clock = record.times[0]
     if len(clock):

@@ -60,7 +60,8 @@ def simultaneous_band(
         raise ValueError(f"method must be 'max' or 'bonferroni', got '{method}'")
     alive = np.isfinite(nees).sum(axis=0)
     judged = np.flatnonzero(alive > 0)
-    low, high = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
+    low = np.full(nees.shape[1], np.nan)
+    high = np.full(nees.shape[1], np.nan)
     none = np.zeros(nees.shape[1], bool)
     if not len(judged):
         return Band(low, high, float("nan"), none, none)
@@ -76,7 +77,8 @@ def simultaneous_band(
         return sides * float(special.ndtr(-c) + 2.0 * special.owens_t(c, slopes).sum())
 
     c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
-    curve, k = anees(nees), alive[judged] * dof
+    curve = anees(nees)
+    k = alive[judged] * dof
     upper, lower = (
         distributions.chi2.sf(alive[judged] * curve[judged], k),
         distributions.chi2.cdf(alive[judged] * curve[judged], k),
@@ -93,7 +95,8 @@ def _slopes(nees: Array) -> Array:
     """sqrt((1 - rho) / (1 + rho)) of neighbours among the steps of (runs, steps); rho from 0 to 1."""
     present = np.isfinite(nees)
     both = present[:, 1:] & present[:, :-1]
-    shared, alive = both.sum(axis=0), present.sum(axis=0)
+    shared = both.sum(axis=0)
+    alive = present.sum(axis=0)
     count = np.maximum(shared, 1)
     a, b = (np.where(both, part, 0.0) for part in (nees[:, :-1], nees[:, 1:]))
     a, b = (np.where(both, part - part.sum(axis=0) / count, 0.0) for part in (a, b))

@@ -53,12 +53,14 @@ def t_squared(whitened: Array, known: StepMoments | None = None) -> tuple[Array,
         known = step_moments(whitened)
     N, mean, S = known
     n = whitened.shape[-1]
-    statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
+    statistic = np.full(len(N), np.nan)
+    p_value = np.full(len(N), np.nan)
     good = n + 1 <= N
     with np.errstate(all="ignore"):
         good &= np.linalg.det(np.where(good[:, None, None], S, np.eye(n))) > 0
     if good.any():
-        m, scatter = mean[good], S[good]
+        m = mean[good]
+        scatter = S[good]
         t2 = N[good] * np.einsum("ki,ki->k", m, np.linalg.solve(scatter, m[..., None])[..., 0])
         statistic[good] = t2
         p_value[good] = special.fdtrc(n, N[good] - n, t2 * (N[good] - n) / (n * (N[good] - 1)))

@@ -53,7 +53,8 @@ def equivalence(
     is_whole : the interval of the two tests is worked out, too
     """
     factor = settings.factor if factor is None else factor
-    top, bottom = (share + (1.0 - share) * factor) * (1.0 - unseen), share + (1.0 - share) / factor
+    top = (share + (1.0 - share) * factor) * (1.0 - unseen)
+    bottom = share + (1.0 - share) / factor
 
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
@@ -62,7 +63,8 @@ def equivalence(
     def p_above(ratio: float) -> float:
         return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, False, weights).above
 
-    below, above = p_below(factor), p_above(1.0 / factor)
+    below = p_below(factor)
+    above = p_above(1.0 / factor)
     interval = None
     if is_whole and len(means) and not share:
         interval = interval_of_tests(p_below, p_above, float(np.average(means, weights=weights)), 1.0 - settings.power)
@@ -92,9 +94,11 @@ def interval_of_tests(
 
 def _end(p_value: Callable[[float], float], ratio: float, sign: float, level: float) -> float:
     """The ratio from which on, upwards or downwards, a test excludes all."""
-    inside, step = 0.0, 0.1
+    inside = 0.0
+    step = 0.1
     while p_value(ratio * float(np.exp(sign * step))) > level:
-        inside, step = step, 2.0 * step
+        inside = step
+        step = 2.0 * step
         if step > FARTHEST:
             return float("inf") if sign > 0 else 0.0
     outside = step
@@ -128,7 +132,8 @@ def equivalence_of_total(total: float, dof: int, settings: Settings, factor: flo
     """
     if not dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
-    below, above = float(distributions.chi2.cdf(total / factor, dof)), float(distributions.chi2.sf(total * factor, dof))
+    below = float(distributions.chi2.cdf(total / factor, dof))
+    above = float(distributions.chi2.sf(total * factor, dof))
     return equivalent(below, above, factor, settings, None)
 
 
@@ -161,7 +166,8 @@ def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_faul
     off = float(np.log(test.ratio)) if test.runs >= FEW else 0.0
     gap = off if settings.one_sided else abs(off)  # one-sided, a ratio below 1 is not a fault and farther from the end
     tail = SHARES[MAIN] * settings.false_alarm / (1 if settings.one_sided else 2)
-    power, room = float(special.ndtri(settings.power)), float(np.log(factor)) - gap
+    power = float(special.ndtri(settings.power))
+    room = float(np.log(factor)) - gap
     fault = gap if low_is_fault or off > 0 else 0.0
 
     def runs(quantile: float, distance: float) -> float:

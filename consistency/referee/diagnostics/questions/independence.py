@@ -88,8 +88,10 @@ def _low_and_high(series: Array, centred: bool) -> Array:
         freedom[-1] = m
     power *= freedom / m  # each is now the same variance times chi-square with that many degrees of freedom
     bands = 2 ** np.arange(int(np.log2(W // 4)) + 1)
-    low, k = np.cumsum(power)[bands], np.cumsum(freedom)[bands]
-    rest, others = power.sum() - low, freedom.sum() - k
+    low = np.cumsum(power)[bands]
+    k = np.cumsum(freedom)[bands]
+    rest = power.sum() - low
+    others = freedom.sum() - k
     if not power.sum() > 0:
         return np.ones(2)
     ratio = (low / k) / np.maximum(rest / others, np.finfo(float).tiny)

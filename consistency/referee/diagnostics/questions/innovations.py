@@ -47,7 +47,8 @@ def nis_test(nis: Array, dof: Array) -> NisTest:
     number of degrees of freedom each step has. Shapes (runs, steps); NaN does not count.
     """
     counted = np.isfinite(nis) & (dof > 0)
-    k, total = int(dof[counted].sum()), float(nis[counted].sum())
+    k = int(dof[counted].sum())
+    total = float(nis[counted].sum())
     if k == 0:
         return NisTest(float("nan"), 0, float("nan"), float("nan"))
     return NisTest(total / k, k, float(distributions.chi2.sf(total, k)), float(distributions.chi2.cdf(total, k)))
@@ -59,16 +60,19 @@ def outliers_of(nis: Array, dof: Array) -> Outliers | None:
     A right filter has any with probability ``IMPOSSIBLE`` at most, so that they may be looked for beside any question.
     """
     rows, columns = np.nonzero(np.isfinite(nis) & (dof > 0))
-    values, n = nis[rows, columns], dof[rows, columns]
+    values = nis[rows, columns]
+    n = dof[rows, columns]
     if not len(values):
         return None
     p = np.minimum(1.0, distributions.chi2.sf(values, n) * len(values))
     far = p < UNLIKELY
-    count, worst = int(far.sum()), int(np.lexsort((-values / n, p))[0])
+    count = int(far.sum())
+    worst = int(np.lexsort((-values / n, p))[0])
     if p[worst] >= IMPOSSIBLE or count > max(1.0, FEW * len(values)) or count == len(values):
         return None
     rest = nis_test(values[~far], n[~far])
-    run, step = int(rows[worst]), int(columns[worst])
+    run = int(rows[worst])
+    step = int(columns[worst])
     return Outliers(count, len(values), run, step, float(values[worst]), int(n[worst]), float(p[worst]), rest)
 
 
@@ -144,7 +148,9 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
         return unknown
     u = np.where(present[..., None], u, 0.0)
     power = float(np.square(u).sum() / (present.sum() * m))
-    statistic, correlation, pairs = 0.0, np.zeros(lags), 0
+    statistic = 0.0
+    correlation = np.zeros(lags)
+    pairs = 0
     for lag in range(1, lags + 1):
         pairs = int((present[:, lag:] & present[:, :-lag]).sum())
         if pairs == 0 or power == 0:
@@ -179,7 +185,8 @@ def innovation_causes(nis: Array, dof: Array, nees_ratio: float) -> list[str]:
     nees_ratio : mean NEES over its degrees of freedom; NaN where no errors are known
     """
     counted = np.isfinite(nis) & (dof > 0) & (nis > 0)
-    values, stated = nis[counted], dof[counted]
+    values = nis[counted]
+    stated = dof[counted]
     if not len(values):
         return []
     if (stated == stated[0]).all():
@@ -187,7 +194,8 @@ def innovation_causes(nis: Array, dof: Array, nees_ratio: float) -> list[str]:
         if other is not None:
             has = f"the NIS is distributed like chi-square with {other} degrees of freedom"
             return [f"{has}, not {stated[0]:.0f} as stated; give the number of components of the innovations"]
-    total, components = float(values.sum()), float(stated.sum())
+    total = float(values.sum())
+    components = float(stated.sum())
     small = total < SMALL * components and distributions.chi2.cdf(total, components) < ODD
     if small and NEES_RIGHT[0] < nees_ratio < NEES_RIGHT[1]:
         return [f"the NEES is about right, and the NIS {components / total:.2g} times too small: {AFTER_UPDATE}"]
@@ -196,7 +204,9 @@ def innovation_causes(nis: Array, dof: Array, nees_ratio: float) -> list[str]:
 
 def _other_dof(nis: Array, stated: int) -> int | None:
     """Degrees of freedom of the chi-square law that NIS (N,) follow where a wrong scale of the stated one does not."""
-    size, mean, log_mean = len(nis), float(nis.mean()), float(np.log(nis).mean())
+    size = len(nis)
+    mean = float(nis.mean())
+    log_mean = float(np.log(nis).mean())
     scale = mean / stated
     scaled = _likelihood(stated, mean / scale, log_mean - np.log(scale)) - np.log(scale)
     for dof in {int(mean), int(mean) + 1} - {0, stated}:

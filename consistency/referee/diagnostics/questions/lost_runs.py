@@ -64,7 +64,8 @@ def lost_of(record: Record, nees: Array, dof: int, settings: Settings, any_time:
     if any_time:
         rates = settings.false_alarm / (i * (i + 1.0))
     is_lost = failed[there] | (np.nan_to_num(means[there]) > lost_bound(dof, rates))
-    lost, level = int(is_lost.sum()), settings.power
+    lost = int(is_lost.sum())
+    level = settings.power
     needed = None
     if any_time:
         upper = _limit_at_any_time(is_lost, level)
@@ -79,7 +80,8 @@ def lost_of(record: Record, nees: Array, dof: int, settings: Settings, any_time:
 
 def _limit_at_any_time(is_lost: Array, level: float) -> float:
     """Smallest share that the bet excludes: shares above it are excluded as well."""
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         if ever(lost_evidence(is_lost, middle)) <= 1.0 - level:
@@ -113,10 +115,14 @@ def early_ends(nees: Array) -> EarlyEnds:
     """
     there = np.isfinite(nees)
     last = np.where(there.any(axis=1), nees.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1), -1)
-    runs, above, gap, variance = 0, 0.0, 0.0, 0.0
+    runs = 0
+    above = 0.0
+    gap = 0.0
+    variance = 0.0
     for step in np.unique(last[(last >= 0) & (last < last.max(initial=-1))]):
         reached = there[:, step]
-        ending, R = last[reached] == step, int(reached.sum())
+        ending = last[reached] == step
+        R = int(reached.sum())
         d = int(ending.sum())
         if d == R:
             continue

@@ -45,10 +45,12 @@ def outliers(whitened: Array, known: StepMoments | None = None) -> Outlier:
     if not len(usable):
         return Outlier(float("nan"), -1, -1, float("nan"))
     precision = np.linalg.inv(S[usable])
-    rows, of_step = np.empty(len(usable), np.int64), np.empty(len(usable))
+    rows = np.empty(len(usable), np.int64)
+    of_step = np.empty(len(usable))
     for here in block_slices(len(usable), len(whitened)):
         d2 = _distances(whitened[:, usable[here]] - mean[usable[here]], precision[here])
-        rows[here], of_step[here] = d2.argmax(axis=0), d2.max(axis=0)
+        rows[here] = d2.argmax(axis=0)
+        of_step[here] = d2.max(axis=0)
     count = N[usable]
     with np.errstate(invalid="ignore"):
         p = distributions.beta.sf(np.minimum(of_step * count / (count - 1.0) ** 2, 1.0), n / 2, (count - n - 1) / 2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,39 +20,9 @@ from consistency.referee.types import Array, Indices
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.groups import Groups
 
-POSITION, ATTITUDE = {"x", "y", "z"}, {"heading", "roll", "pitch", "yaw"}
+POSITION = {"x", "y", "z"}
+ATTITUDE = {"heading", "roll", "pitch", "yaw"}
 VELOCITY = {"vx", "vy", "vz"}
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Whitened errors of a record and the names of their components; N runs, T steps, n components."""
-
-    record: Record  # with errors and covariances
-    whitened: Array  # (N, T, n), NaN where nothing counts
-    names: tuple[str, ...]
-    groups: Mapping[str, list[int]]  # components, named groups and subsets
-    centre: Centre | None = None  # where ``whitened`` is of the errors about it
-
-    @property
-    def error(self) -> Array:
-        """(N, T, n)."""
-        assert self.record.error is not None
-        return self.record.error
-
-    @property
-    def reported(self) -> dict[str, list[int]]:
-        """The groups and velocity, whose ratio is reported and not tested."""
-        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
-        groups = dict(self.groups)
-        if 1 < len(velocity) < len(self.names):
-            groups.setdefault("velocity", velocity)
-        return groups
-
-    @property
-    def covariance(self) -> Array:
-        """(N, T, n, n)."""
-        return np.asarray(self.record.covariance, float)
 
 
 class Centre(NamedTuple):
@@ -80,21 +50,43 @@ class InGroup(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """NEES of N runs in T steps; with errors where they are known.
+    """NEES of N runs in T steps; where errors of n components are known, these in units of their covariance.
 
     The arrays may be large: they are processed in blocks of runs or steps, and no other array of their size is kept.
     """
 
+    record: Record
     nees: Array  # (N, T), NaN where nothing counts
     dof: int
-    errors: Errors | None = None
-    groups: Groups | None = None
+    whitened: Array | None = None  # (N, T, n), NaN where nothing counts; None where NEES stand alone
+    names: tuple[str, ...] = ()  # of the components
+    components: Mapping[str, list[int]] = field(default_factory=dict)  # each, and named groups and subsets of them
+    centre: Centre | None = None  # where ``whitened`` is of the errors about it
 
     @property
-    def known_errors(self) -> Errors:
-        """Errors of a sample that has them."""
-        assert self.errors is not None
-        return self.errors
+    def error(self) -> Array:
+        """(N, T, n), of a sample with errors."""
+        assert self.record.error is not None
+        return self.record.error
+
+    @property
+    def covariance(self) -> Array:
+        """(N, T, n, n), of a sample with errors."""
+        return np.asarray(self.record.covariance, float)
+
+    @property
+    def reported(self) -> dict[str, list[int]]:
+        """The components and velocity, whose ratio is reported and not tested."""
+        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
+        components = dict(self.components)
+        if 1 < len(velocity) < len(self.names):
+            components.setdefault("velocity", velocity)
+        return components
+
+    @property
+    def groups(self) -> Groups | None:
+        """Groups of runs and steps, (N, T)."""
+        return self.record.groups
 
     @cached_property
     def counted(self) -> Array:
@@ -123,9 +115,8 @@ class Sample:
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""
-        e = self.known_errors
         if centre is None:
-            centre = e.centre
+            centre = self.centre
         if centre is not None:
             centre = Centre(centre.mean[steps], centre.factor[steps])
 
@@ -134,30 +125,32 @@ class Sample:
                 error = centre.about(error, counted)
             return means_and_counts(np.where(counted, squared_length(whiten_group(error, P, index)), np.nan))
 
-        means, counts = by_runs(of_block, e.error[:, steps], e.covariance[:, steps], self.counted[:, steps]).T
+        means, counts = by_runs(of_block, self.error[:, steps], self.covariance[:, steps], self.counted[:, steps]).T
         return np.asarray(means[counts > 0] / len(index))
 
-    def centre(self) -> Centre:
+    def mean_error(self) -> Centre:
         """Mean error over runs in each step."""
-        error, N = self.known_errors.error, self.counted.sum(axis=0)[:, None]
-        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), error, self.counted)
+        N = self.counted.sum(axis=0)[:, None]
+        total = by_steps(lambda e, here: np.where(here[..., None], e, 0.0).sum(axis=0), self.error, self.counted)
         factor = np.sqrt(N / np.maximum(N - 1, 1))
         return Centre(total / np.maximum(N, 1), np.where(N > 1, factor, np.nan))
 
     def centred_means(self, steps: slice) -> Array:
         """:meth:`means` of errors less their mean over runs in each step."""
-        return self.group_means(range(self.dof), steps, self.centre())
+        return self.group_means(range(self.dof), steps, self.mean_error())
 
     def centred(self) -> Sample:
         """Errors less their mean over runs in each step, with the variance that they would have without a bias.
 
         Overwrites this sample's NEES and whitened errors in place; do not use it afterwards.
         """
-        e, centre = self.known_errors, self.centre()
+        assert self.whitened is not None
+        centre = self.mean_error()
         for here in of_runs(self.counted):
-            w = whiten(centre.about(e.error[here], self.counted[here]), e.covariance[here])
-            e.whitened[here], self.nees[here] = w, squared_length(w)
-        return Sample(self.nees, self.dof, replace(e, centre=centre), self.groups)
+            w = whiten(centre.about(self.error[here], self.counted[here]), self.covariance[here])
+            self.whitened[here] = w
+            self.nees[here] = squared_length(w)
+        return replace(self, centre=centre)
 
 
 def sample_of(record: Record, settings: Settings) -> Sample | None:
@@ -173,11 +166,12 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
             return None
         if not record.dof:
             raise ValueError("nees needs dof, the dimension of the error")
-        return Sample(record.nees, record.dof, groups=record.groups)
+        return Sample(record, record.nees, record.dof)
     names = names_of(record)
-    groups = component_groups(names, settings.subsets)
-    error, P = record.error, np.asarray(record.covariance, float)
-    whitened, nees = np.empty(error.shape), np.empty(error.shape[:2])
+    error = record.error
+    P = np.asarray(record.covariance, float)
+    whitened = np.empty(error.shape)
+    nees = np.empty(error.shape[:2])
     for here in of_runs(nees):
         w = whiten(error[here], P[here])
         counted = all_finite(w)
@@ -186,7 +180,7 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(nees, error.shape[-1], Errors(record, whitened, names, groups), record.groups)
+    return Sample(record, nees, error.shape[-1], whitened, names, component_groups(names, settings.subsets))
 
 
 def names_of(record: Record) -> tuple[str, ...]:

@@ -87,8 +87,10 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weight
     if runs == 0:
         return MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
     weighted = weighted_of(means, weights)
-    ratio, least = weighted.ratio, dof / weighted.squares
-    nu, spread = float(least), float("inf")
+    ratio = weighted.ratio
+    least = dof / weighted.squares
+    nu = float(least)
+    spread = float("inf")
     if runs >= FEW * weighted.squares and (steps > 1 or not gaussian) and means.min() > 0:
         by_spread, left_out = _log_nu_of_means(weighted.values)
         by_spread, variance = _at_mean_one(by_spread, left_out, weighted.values, 2.0 / runs)
@@ -97,7 +99,8 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weight
         safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error - np.log(weighted.squares))
         log_nu = min(*safe, float(np.log(dof * steps)))
         if log_nu > np.log(least) or not gaussian:
-            nu, spread = float(np.exp(log_nu)), 2.0 / variance
+            nu = float(np.exp(log_nu))
+            spread = 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
     return MeanTest(runs, ratio, nu, spread, above, below)
 
@@ -188,20 +191,26 @@ def ratio_interval(
     if not len(means):
         return UNKNOWN
     weighted = weighted_of(means, weights)
-    ratio, tail, least = weighted.ratio, 0.5 * (1.0 - confidence), dof / weighted.squares
+    ratio = weighted.ratio
+    tail = 0.5 * (1.0 - confidence)
+    least = dof / weighted.squares
     if not means.max() > 0:
         return Interval(ratio, ratio, ratio)
-    nu, spread, enough = float(least), float("inf"), len(means) >= FEW * weighted.squares
+    nu = float(least)
+    spread = float("inf")
+    enough = len(means) >= FEW * weighted.squares
     if len(means) > 1 and means.max() > means.min():
         log_nu, left_out = _log_nu_of_means(weighted.values)
         if enough:
             variance = max(_jackknife(left_out, left_out), 2.0 / len(means))
-            nu, spread = float(np.exp(log_nu)), max(2.0 / variance, LEAST)
+            nu = float(np.exp(log_nu))
+            spread = max(2.0 / variance, LEAST)
         else:
             nu = min(nu, float(np.exp(log_nu)))
     elif enough:
         return Interval(ratio, ratio, ratio)
-    z, k = float(distributions.t.isf(tail, spread)), len(means) * nu
+    z = float(distributions.t.isf(tail, spread))
+    k = len(means) * nu
     low, high = (float(distributions.chi2.ppf(special.ndtr(s), k)) for s in (z, -z))
     upper = ratio * k / max(high, 1e-300)
     for _ in range(ITERATIONS if enough and nu > least else 0):  # the spread of means whose ratio is upper
@@ -214,7 +223,9 @@ def ratio_interval(
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
     means = np.ldexp(means, -np.frexp(means.max())[1])  # exact, and no square leaves the range of numbers
-    runs, mean, left = len(means), means.mean(), _left_out_mean(means)
+    runs = len(means)
+    mean = means.mean()
+    left = _left_out_mean(means)
     squares = np.square(means).sum()
     cv = max(means.var(ddof=1) / mean**2, 1e-12)
     variance = (squares - np.square(means) - (runs - 1) * left**2) / max(runs - 2, 1)
@@ -233,7 +244,8 @@ def _log_nu_of_gamma(means: Array, weights: Array | None = None) -> tuple[Array,
         gap = np.log(means.mean(axis=0)) - np.log(means).mean(axis=0)
     else:
         share = np.square(weights) / np.square(weights).sum()
-        gap, runs = np.log(share @ means) - share @ np.log(means), 1.0 / np.square(share).sum()
+        gap = np.log(share @ means) - share @ np.log(means)
+        runs = 1.0 / np.square(share).sum()
     gap = np.maximum(gap, 1e-12)
     log_a = np.log((3.0 - gap + np.sqrt((gap - 3.0) ** 2 + 24.0 * gap)) / (12.0 * gap))  # Minka (2002), to 1.5 %
     for _ in range(5):  # Newton in log a
@@ -258,7 +270,8 @@ def _jackknife(a: Array, b: Array) -> float:
 def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
     """log nu moved down to where it would be at a mean of 1, never up, and the variance that is left."""
     log_mean = np.log(_left_out_mean(means))
-    of_mean, both = _jackknife(log_mean, log_mean), _jackknife(left_out, log_mean)
+    of_mean = _jackknife(log_mean, log_mean)
+    both = _jackknife(left_out, log_mean)
     slope = both / of_mean if of_mean > 0 else 0.0
     reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
     variance = max(_jackknife(left_out, left_out) - slope * both, floor)
@@ -284,7 +297,8 @@ def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
     """Upper and lower p value of ``ratio`` = chi-square(k) / k, widened from normal to Student's t."""
     if not np.isfinite(k):
         return float(ratio <= 1.0), float(ratio >= 1.0)
-    upper, lower = special.chdtrc(k, k * ratio), special.chdtr(k, k * ratio)
+    upper = special.chdtrc(k, k * ratio)
+    lower = special.chdtr(k, k * ratio)
     if not np.isfinite(spread):
         return float(upper), float(lower)
     above, below = (special.stdtr(spread, float(special.ndtri(p))) for p in (upper, lower))

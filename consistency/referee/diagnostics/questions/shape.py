@@ -48,7 +48,8 @@ def sphericity(whitened: Array, known: StepMoments | None = None) -> tuple[Array
         known = step_moments(whitened)
     N, _, S = known
     n = whitened.shape[-1]
-    statistic, p_value = np.full(len(N), np.nan), np.full(len(N), np.nan)
+    statistic = np.full(len(N), np.nan)
+    p_value = np.full(len(N), np.nan)
     good = (4 * n <= N) & (np.trace(S, axis1=-2, axis2=-1) > 0)
     if n == 1 or not good.any():
         return statistic, p_value
@@ -237,14 +238,16 @@ def largest_direction(whitened: Array) -> Largest:
     whitened : (runs, steps, n), NaN where a run has no value. p is NaN with fewer than 2 runs or n = 1.
     """
     present = all_finite(whitened)
-    n, some = whitened.shape[-1], present.any(axis=1)
+    n = whitened.shape[-1]
+    some = present.any(axis=1)
     if some.sum() < 2 or n == 1:
         return Largest(UNKNOWN, np.full(n, np.nan), float("nan"))
     count = present.sum(axis=1)
     moments = by_runs(second_moments, whitened, present)[some] / count[some, None, None]
     steps = int(count.max())
     halves = [np.arange(len(moments)) % 2 == k for k in (0, 1)]
-    along, p_values = np.empty(len(moments)), []
+    along = np.empty(len(moments))
+    p_values = []
     for chosen, judged in (halves, halves[::-1]):
         u = _leading(moments[chosen])
         along[judged] = np.einsum("i,rij,j->r", u, moments[judged], u)

@@ -17,7 +17,8 @@ from consistency.referee.types import Array
 OF_ERRORS = {"nees", "anees", "error", "errors", "err", "ate", "ape", "rpe"}
 OF_SIGMAS = {"sigma", "std", "stddev", "stdev", "cov", "covariance", "variance", "var"}
 OF_POSES = {"position", "pos", "rotation", "attitude", "pose", "stated", "own"}
-OF_TRUTH, OF_ESTIMATE = {"true", "truth", "gt", "groundtruth"}, {"est", "estimate", "estimated", "state"}
+OF_TRUTH = {"true", "truth", "gt", "groundtruth"}
+OF_ESTIMATE = {"est", "estimate", "estimated", "state"}
 OF_TIME = {"t", "time", "timestamp", "step", "run"}
 UNITS = (1.0, 2.0, 3.0, 100.0, 1000.0, 180.0 / np.pi)  # in which a sigma may stand: multiples, cm, mm, degrees
 ALIKE = 1e-3  # of the spread of a column: how well it is a function of something else
@@ -60,7 +61,9 @@ def selects_on_outcome(
     truth, estimate : (..., m), their values, where they are known
     covariance : (..., n, n)
     """
-    name, values, words = column.name, column.values.ravel(), _words_of(column.name)
+    name = column.name
+    values = column.values.ravel()
+    words = _words_of(column.name)
     if words and words <= OF_TIME:
         return ""
     components = {axis.lower() for axis in axes}
@@ -126,14 +129,16 @@ def _components(state: Array) -> Iterator[Array]:
 
 def _is_same(values: Array, other: Array) -> bool:
     both = np.isfinite(values) & np.isfinite(other)
-    v, o = values[both], other[both]
+    v = values[both]
+    o = other[both]
     return len(v) >= FEWEST and len(np.unique(v)) > 2 and bool((np.abs(v - o) <= ALIKE * np.abs(o)).all())
 
 
 def _is_linear(values: Array, other: Array) -> bool:
     """Is a column something else in other units, to rounding?"""
     both = np.isfinite(values) & np.isfinite(other)
-    v, o = values[both] - values[both].mean(), other[both] - other[both].mean()
+    v = values[both] - values[both].mean()
+    o = other[both] - other[both].mean()
     if len(v) < FEWEST or len(np.unique(v)) <= 2 or not o.any() or _goes_one_way(v):
         return False
     rest = v - o * (v @ o) / (o @ o)

@@ -181,7 +181,8 @@ class Record:
         from consistency.referee.diagnostics.records.skipping import without_first
 
         arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
-        world, t = self.world, self.times
+        world = self.world
+        t = self.times
         if world is not None:
             arrays |= {"world covariance": world.covariance, "world nees": world.nees}
         if t is None and len(self.t):

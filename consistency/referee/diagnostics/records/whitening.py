@@ -20,7 +20,8 @@ def whiten(error: Array, covariance: Array) -> Array:
     Shapes (..., n) and (..., n, n) -> (..., n). Rows that hold a NaN, or whose covariance is not positive
     definite, come back as NaN.
     """
-    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    e = np.asarray(error, float)
+    P = np.asarray(covariance, float)
     P = np.broadcast_to(P, (*e.shape, P.shape[-1]))
     if e.shape[-1] >= LARGE:
         return _whiten_matrix_by_matrix(e, P)
@@ -58,13 +59,16 @@ def _less(value: Array, a: list[Array], b: list[Array]) -> Array:
 
 
 def _whiten_matrix_by_matrix(error: Array, covariance: Array) -> Array:
-    n, batch = error.shape[-1], error.shape[:-1] or (1,)
-    e, P = error.reshape(*batch, n), covariance.reshape(*batch, n, n)
+    n = error.shape[-1]
+    batch = error.shape[:-1] or (1,)
+    e = error.reshape(*batch, n)
+    P = covariance.reshape(*batch, n, n)
     out = np.full(e.shape, np.nan)
     count = e.size // n
     for here in block_slices(count, n * n, NUMBERS):
         index = np.unravel_index(np.arange(here.start, min(here.stop, count)), batch)
-        some, matrices = e[index], P[index]
+        some = e[index]
+        matrices = P[index]
         known = np.isfinite(some).all(axis=1) & np.isfinite(matrices).all(axis=(1, 2))
         some[~known] = np.nan
         some[known] = _solve(some[known], matrices[known])
@@ -85,7 +89,8 @@ def _solve(e: Array, P: Array) -> Array:
 
 def standardise(error: Array, covariance: Array) -> Array:
     """Each component over its own standard deviation, (..., n) and (..., n, n) -> (..., n); NaN where that is 0."""
-    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    e = np.asarray(error, float)
+    P = np.asarray(covariance, float)
     if e.ndim == 1:
         return _standardise(e, P)
     return by_runs(_standardise, e, P)

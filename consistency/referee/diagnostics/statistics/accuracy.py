@@ -20,15 +20,19 @@ def coverage(error: Array, covariance: Array, bound: float = 2.0, counted: Array
 
     Shapes (..., n) and (..., n, n) -> (n,); rows with NaN, or not ``counted`` (...), do not count.
     """
-    error, P = np.asarray(error, float), np.asarray(covariance, float)
+    error = np.asarray(error, float)
+    P = np.asarray(covariance, float)
     if error.ndim == 1:
-        error, P = error[None], P[None]
+        error = error[None]
+        P = P[None]
     P = np.broadcast_to(P, (*error.shape, error.shape[-1]))
     n = error.shape[-1]
-    inside, count = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    inside = np.zeros(n, np.int64)
+    count = np.zeros(n, np.int64)
     for here in of_runs(error):
         for i in range(n):
-            e, sigma = error[here][..., i], _sigma(P[here][..., i, i])
+            e = error[here][..., i]
+            sigma = _sigma(P[here][..., i, i])
             valid = np.isfinite(e) & np.isfinite(sigma)
             if counted is not None:
                 valid &= counted[here]
@@ -55,7 +59,8 @@ def rmse(error: Array, axes: Sequence[int] | None = None, counted: Array | None 
     e = np.asarray(error, float)
     if axes is None:
         axes = range(e.shape[-1])
-    squared, count = np.empty(e[..., 0].size), 0
+    squared = np.empty(e[..., 0].size)
+    count = 0
     for here in of_runs(e):
         part = squared_length(e[here][..., list(axes)])
         known = np.isfinite(part)
@@ -82,7 +87,8 @@ def coverage_interval(
     not. Shapes (runs, steps, n), (runs, steps, n, n) -> (n,), (n, 2); rows with NaN, or not ``counted`` (runs, steps),
     are not drawn.
     """
-    error, P = np.asarray(error, float), np.asarray(covariance, float)
+    error = np.asarray(error, float)
+    P = np.asarray(covariance, float)
     there = by_runs(_usable, error, P)
     if counted is not None:
         there &= counted
@@ -128,7 +134,8 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
 def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     n = error.shape[-1]
     present = np.isfinite(nees) & all_finite(error) & (nees > 0)
-    index, inclination = np.full(nees.shape[1], np.nan), np.full(nees.shape[1], np.nan)
+    index = np.full(nees.shape[1], np.nan)
+    inclination = np.full(nees.shape[1], np.nan)
     count = present.sum(axis=0)
     e = np.where(present[..., None], error, 0.0)
     by_step = np.ascontiguousarray(np.moveaxis(e, 1, 0))

@@ -109,7 +109,8 @@ class Kolmogorov:
 def _within(distance: float, N: int) -> float:
     """Probability of at most that distance: an entry of the N-th power of a matrix of transitions."""
     k = int(N * distance) + 1
-    m, h = 2 * k - 1, k - N * distance
+    m = 2 * k - 1
+    h = k - N * distance
     H: Array = (np.arange(m)[:, None] - np.arange(m) + 1 >= 0).astype(float)
     H[:, 0] -= h ** np.arange(1, m + 1)
     H[-1] -= h ** np.arange(m, 0, -1)
@@ -123,18 +124,25 @@ def _within(distance: float, N: int) -> float:
 
 def _power(H: Array, N: int) -> tuple[Array, float]:
     """H to the power of N, scaled, and the logarithm of the scale."""
-    out, scale, square, of_square = np.eye(len(H)), 0.0, H, 0.0
+    out = np.eye(len(H))
+    scale = 0.0
+    square = H
+    of_square = 0.0
     while True:
         if N & 1:
-            out, scale = out @ square, scale + of_square
+            out = out @ square
+            scale = scale + of_square
             size = out.max()
-            out, scale = out / size, scale + np.log(size)
+            out = out / size
+            scale = scale + np.log(size)
         N >>= 1
         if not N:
             return out, scale
-        square, of_square = square @ square, 2.0 * of_square
+        square = square @ square
+        of_square = 2.0 * of_square
         size = square.max()
-        square, of_square = square / size, of_square + np.log(size)
+        square = square / size
+        of_square = of_square + np.log(size)
 
 
 def _positive(dof: Value) -> Value:
@@ -142,4 +150,7 @@ def _positive(dof: Value) -> Value:
     return np.where(dof > 0.0, dof, np.nan)[()]
 
 
-chi2, t, beta, kolmogorov = ChiSquare, Student, Beta, Kolmogorov
+chi2 = ChiSquare
+t = Student
+beta = Beta
+kolmogorov = Kolmogorov

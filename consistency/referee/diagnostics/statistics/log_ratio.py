@@ -67,8 +67,10 @@ def contrast(a: Array, b: Array, sign: float, paired: bool) -> Contrast:
     paired : row i of both is the same trial (R = S); otherwise the runs are independent, and Student's t has as many
         degrees of freedom as the filter with fewer runs allows
     """
-    x, y = a / a.mean() - 1.0, sign * (b / b.mean() - 1.0)
-    of_a, of_b = x.var(ddof=1) / len(x), y.var(ddof=1) / len(y)
+    x = a / a.mean() - 1.0
+    y = sign * (b / b.mean() - 1.0)
+    of_a = x.var(ddof=1) / len(x)
+    of_b = y.var(ddof=1) / len(y)
     if paired:
         z = x + y
         variance = z.var(ddof=1) / len(z)
@@ -76,7 +78,8 @@ def contrast(a: Array, b: Array, sign: float, paired: bool) -> Contrast:
         bend = _third_moment(change, z)
     else:
         variance = of_a + of_b
-        change_a, change_b = x * x - 2.0 * x * _product(x, x), y * y - 2.0 * sign * y * _product(y, y)
+        change_a = x * x - 2.0 * x * _product(x, x)
+        change_b = y * y - 2.0 * sign * y * _product(y, y)
         bend = _third_moment(change_a, x) + _third_moment(change_b, y)
     value = float(np.log(a.mean()) + sign * np.log(b.mean()))
     freedom = min(len(a), len(b)) - 1.0

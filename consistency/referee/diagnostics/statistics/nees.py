@@ -59,7 +59,8 @@ def binomial_interval(count: Any, draws: Any, confidence: float = CONFIDENCE) ->
     """
     count, draws = np.broadcast_arrays(np.asarray(count, float), np.asarray(draws, float))
     tail = 0.5 * (1.0 - confidence)
-    some, not_all = count > 0.0, count < draws
+    some = count > 0.0
+    not_all = count < draws
     low = special.betaincinv(np.where(some, count, 1.0), draws - count + 1.0, tail)
     high = special.betaincinv(count + 1.0, np.where(not_all, draws - count, 1.0), 1.0 - tail)
     return np.where(some, low, 0.0), np.where(not_all, high, 1.0)
@@ -83,13 +84,15 @@ def nees(error: Array, covariance: Array) -> Array:
         Shapes do not fit, a value is not finite, or a covariance is not symmetric or not positive
         definite; the message names the first index.
     """
-    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    e = np.asarray(error, float)
+    P = np.asarray(covariance, float)
     n = e.shape[-1] if e.ndim else 0
     try:
         if P.shape[-2:] != (n, n):
             raise ValueError
         batch = np.broadcast_shapes(e.shape[:-1], P.shape[:-2])
-        e, P = np.broadcast_to(e, (*batch, n)), np.broadcast_to(P, (*batch, n, n))
+        e = np.broadcast_to(e, (*batch, n))
+        P = np.broadcast_to(P, (*batch, n, n))
     except ValueError:
         raise ValueError(f"error {e.shape} and covariance {P.shape} must be (..., n) and (..., n, n)") from None
     _require(np.isfinite(e), "the error is not finite", 1)

@@ -112,7 +112,8 @@ def lost_runs(share: float, power: float = POWER, lost: int = 0) -> int:
 
 def power_of(dof: float, runs: int, ratio: float, false_alarm: float = FALSE_ALARM, two_sided: bool = True) -> float:
     """Probability that ``runs`` runs find a covariance wrong by ``ratio``; the complement of :func:`required_runs`."""
-    tail, k = _one_tail(false_alarm, two_sided), dof * runs
+    tail = _one_tail(false_alarm, two_sided)
+    k = dof * runs
     if ratio > 1.0:
         return float(distributions.chi2.sf(distributions.chi2.isf(tail, k) / ratio, k))
     return float(distributions.chi2.cdf(distributions.chi2.ppf(tail, k) / ratio, k))

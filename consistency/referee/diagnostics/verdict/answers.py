@@ -12,13 +12,17 @@ from consistency.referee.diagnostics.verdict.parts import Answer
 from consistency.referee.types import Array
 
 CERTAIN = 0.999  # false-alarm rate, at most
-MAIN, STEP, AXIS, DIRECTION = "scale", "scale in some step", "scale of an axis", "scale in some direction"
+MAIN = "scale"
+STEP = "scale in some step"
+AXIS = "scale of an axis"
+DIRECTION = "scale in some direction"
 SCALE = (MAIN, STEP, AXIS, DIRECTION)
 BIAS = ("bias", "bias in some step")
 SHAPE = ("shape", "shape in some step")
 INNOVATIONS = ("innovation scale", "innovation whiteness")
 GROUP = "scale in some group"
-JOINT, JOINT_DISTRIBUTION = "scale of pose and map", "distribution of pose and map"
+JOINT = "scale of pose and map"
+JOINT_DISTRIBUTION = "distribution of pose and map"
 # Share of the false-alarm rate of each question; those that are asked share what the main one leaves. Half goes to
 # the mean over the trajectory, so that the number of runs planned for a covariance ratio does not depend on what
 # else is asked.
@@ -125,7 +129,8 @@ def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answ
     asked = {question: p for question, p in p_values.items() if np.isfinite(p)}
     share = shares_of(asked)
     found: dict[str, Answer] = {}
-    left, least = 1.0, 0.0
+    left = 1.0
+    least = 0.0
     for question in sorted(asked, key=lambda q: asked[q] / share[q]):
         least = max(least, min(1.0, asked[question] * left / share[question]))
         found[question] = Answer(question, asked[question], share[question], least, least <= false_alarm)
@@ -157,6 +162,11 @@ def at_share(given: Sequence[Answer], settings: Settings) -> Settings:
         if answer.question == MAIN:
             share = answer.share
     return replace(settings, false_alarm=min(settings.false_alarm * share / SHARES[MAIN], CERTAIN))
+
+
+def faults_of(given: Sequence[Answer]) -> dict[str, Answer]:
+    """Answers that found a fault, those within the tolerance left out, by question."""
+    return {answer.question: answer for answer in given if answer.found and not answer.tolerated}
 
 
 def with_tolerated(given: Sequence[Answer], questions: Collection[str]) -> tuple[Answer, ...]:

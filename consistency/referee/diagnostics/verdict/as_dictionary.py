@@ -8,8 +8,6 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.skipping import Skipped
 from consistency.referee.diagnostics.verdict.parts import (
-    Accuracy,
-    Axes,
     Bias,
     ByGroup,
     EarlyEnds,
@@ -29,9 +27,7 @@ from consistency.referee.diagnostics.verdict.parts import (
 Numbers = dict[str, Any]
 
 
-def scale_numbers(scale: Scale | None) -> Numbers:
-    if scale is None:
-        return {}
+def scale_numbers(scale: Scale) -> Numbers:
     return {
         "dof": scale.dof,
         "anees": scale.anees,
@@ -71,16 +67,11 @@ def equivalence_numbers(equivalence: Equivalence | None) -> Numbers | None:
     return vars(equivalence) | {"shown": equivalence.shown}
 
 
-def lost_numbers(lost: Lost | None, asked: float | None) -> Numbers:
-    if lost is None:
-        return {}
-    numbers = {"asked": asked, "count": lost.count, "runs": lost.runs, "bound": lost.bound, "upper": lost.upper}
-    return {"lost": numbers | {"level": lost.level, "needed": lost.needed}}
+def lost_numbers(asked: float | None, lost: Lost) -> Numbers:
+    return {"lost": {"asked": asked} | vars(lost)}
 
 
-def location_numbers(location: Location | None) -> Numbers:
-    if location is None:
-        return {}
+def location_numbers(location: Location) -> Numbers:
     until = None
     if location.until is not None:
         until = location.until.step
@@ -97,17 +88,7 @@ def location_numbers(location: Location | None) -> Numbers:
     }
 
 
-def axes_numbers(axes: Axes) -> Numbers:
-    return {
-        "axes": axes.names,
-        "groups": {key: list(index) for key, index in axes.groups.items()},
-        "of_axes": {key: tuple(interval) for key, interval in axes.inflation.items()},
-    }
-
-
-def bias_numbers(bias: Bias | None) -> Numbers:
-    if bias is None:
-        return {}
+def bias_numbers(bias: Bias) -> Numbers:
     by_axis = {axis: tuple(interval) for axis, interval in bias.by_axis.items()}
     numbers: Numbers = {"bias": by_axis, "bias_step": bias.step}
     if bias.inflation_without is not None:
@@ -117,9 +98,7 @@ def bias_numbers(bias: Bias | None) -> Numbers:
     return numbers
 
 
-def shape_numbers(shape: Shape | None) -> Numbers:
-    if shape is None:
-        return {}
+def shape_numbers(shape: Shape) -> Numbers:
     a, b = shape.pair or (None, None)
     return {
         "shape": shape.matrix,
@@ -129,16 +108,12 @@ def shape_numbers(shape: Shape | None) -> Numbers:
     }
 
 
-def tails_numbers(tails: Tails | None) -> Numbers:
-    if tails is None:
-        return {}
+def tails_numbers(tails: Tails) -> Numbers:
     outlier = {"run": tails.run, "step": tails.step, "distance": tails.distance}
     return {"outlier": outlier, "pit": tails.pit, "pit_half_width": tails.half_width}
 
 
-def innovations_numbers(innovations: Innovations | None) -> Numbers:
-    if innovations is None:
-        return {}
+def innovations_numbers(innovations: Innovations) -> Numbers:
     numbers = {
         "nis_ratio": innovations.ratio,
         "nis_interval": list(innovations.interval),
@@ -153,15 +128,7 @@ def innovations_numbers(innovations: Innovations | None) -> Numbers:
     return numbers
 
 
-def accuracy_numbers(accuracy: Accuracy | None) -> Numbers:
-    if accuracy is None:
-        return {}
-    return dict(vars(accuracy))
-
-
-def joint_numbers(joint: JointScore | None) -> Numbers:
-    if joint is None:
-        return {}
+def joint_numbers(joint: JointScore) -> Numbers:
     return {
         "joint_ratio": joint.both.value,
         "joint_ratio_interval": tuple(joint.both[1:]),
@@ -174,9 +141,7 @@ def joint_numbers(joint: JointScore | None) -> Numbers:
     }
 
 
-def rejection_numbers(rejection: RejectionScore | None) -> Numbers:
-    if rejection is None:
-        return {}
+def rejection_numbers(rejection: RejectionScore) -> Numbers:
     return {
         "rejected": rejection.rejected,
         "offered": rejection.offered,
@@ -187,21 +152,15 @@ def rejection_numbers(rejection: RejectionScore | None) -> Numbers:
     }
 
 
-def ends_numbers(ends: EarlyEnds | None) -> Numbers:
-    if ends is None:
-        return {}
+def ends_numbers(ends: EarlyEnds) -> Numbers:
     return {"early_ends": vars(ends) | {"lost": ends.lost}}
 
 
-def skipped_numbers(skipped: Skipped | None) -> Numbers:
-    if skipped is None:
-        return {}
+def skipped_numbers(skipped: Skipped) -> Numbers:
     return {"skip": skipped.skip.option, "skipped_steps": skipped.steps, "skipped_runs": skipped.empty}
 
 
-def truth_numbers(truth: TruthShare | None) -> Numbers:
-    if truth is None:
-        return {}
+def truth_numbers(truth: TruthShare) -> Numbers:
     return {
         "truth_share": truth.share,
         "truth_share_of_axes": dict(truth.by_axis),
@@ -210,9 +169,7 @@ def truth_numbers(truth: TruthShare | None) -> Numbers:
     }
 
 
-def group_numbers(by: ByGroup | None) -> Numbers:
-    if by is None:
-        return {}
+def group_numbers(by: ByGroup) -> Numbers:
     groups = [
         {
             "name": group.name,

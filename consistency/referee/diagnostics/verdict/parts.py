@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -102,9 +102,14 @@ class Scale:
     def judged_steps(self) -> int:
         return int((self.alive > 0).sum())
 
+    @property
+    def not_shown(self) -> Scale:
+        """The same scale where it is shown to be nothing."""
+        return replace(self, equivalence=replace(self.equivalence, p_value=float("nan"), runs=None))
+
 
 @dataclass(frozen=True)
-class Axes:
+class ComponentRatios:
     """The error by component; n components."""
 
     names: tuple[str, ...]
@@ -331,7 +336,7 @@ class ErrorParts(NamedTuple):
 
     scale: Scale | None = None
     location: Location | None = None
-    axes: Axes | None = None
+    axes: ComponentRatios | None = None
     bias: Bias | None = None
     shape: Shape | None = None
     tails: Tails | None = None

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record, shown_by
-from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.answers import Settings, faults_of
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
     Answer,
-    Axes,
     Bias,
     ByGroup,
+    ComponentRatios,
     EarlyEnds,
     Equivalence,
     Innovations,
@@ -37,7 +38,6 @@ from consistency.referee.types import Array, Failure, Indices
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.skipping import Skipped
 
-Faults = Mapping[str, Answer]  # answers that found a fault, by their question
 UNKNOWN_ENDS = (float("nan"), float("nan"))
 
 
@@ -55,7 +55,7 @@ class Findings:
     impossible: tuple[tuple[int, int], ...] = ()  # (run, step) of what no filter may say
     left_out_steps: tuple[int, ...] = ()  # rank-deficient covariance
     scale: Scale | None = None
-    axes: Axes | None = None
+    axes: ComponentRatios | None = None
     bias: Bias | None = None
     shape: Shape | None = None
     tails: Tails | None = None
@@ -72,7 +72,9 @@ class Findings:
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
     truth: TruthShare | None = None  # where the truth has a covariance of its own
-    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
+    parts: Mapping[str, Findings] = field(default_factory=dict)  # where cross terms between them are not stated
+    unshown: str = ""  # why nothing can be shown, so that nothing is decided
+    later: bool = False  # nothing is decided at this look, which asks the scale alone and found no fault in it
 
     @property
     def consistent(self) -> bool:
@@ -111,20 +113,22 @@ class Findings:
             side = -1.0
         elif self.settings.one_sided:
             side = 1.0
-        worst, farthest = None, -np.inf
+        worst = None
+        farthest = -np.inf
         for axis, interval in self.axes.inflation.items():
             log = float(np.log(max(interval.value, TINY)))
             if axis not in self.axes.names or not np.isfinite(log):
                 continue
             distance = side * log if side else abs(log)
             if distance > farthest:
-                worst, farthest = (axis, interval), distance
+                worst = (axis, interval)
+                farthest = distance
         return worst
 
     @property
     def faults(self) -> tuple[str, ...]:
         """Questions in which a fault was found, those within the tolerance left out."""
-        return tuple(a.question for a in self.answers if a.found and not a.tolerated)
+        return tuple(faults_of(self.answers))
 
     @property
     def p_value(self) -> float:
@@ -214,6 +218,7 @@ class Verdict(Findings):
     ``print`` shows the sentence and a short table.
     """
 
+    parts: Mapping[str, Verdict] = field(default_factory=dict)  # where cross terms between them are not stated
     reasons: tuple[str, ...] = ()  # the first is a sentence to act on
     details: tuple[str, ...] = ()  # of the reasons, those that only --verbose shows on a terminal
     axis: tuple[str, Interval] | None = None  # that decides the status, with its ratio; None where the whole does
@@ -237,76 +242,11 @@ class Verdict(Findings):
     @property
     def statistics(self) -> dict[str, Any]:
         """Every number as one flat dictionary, as ``--json`` has it; parts that could not be computed are left out."""
-        from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
-
-        numbers: dict[str, Any] = {
-            "runs": self.runs,
-            "steps": self.steps,
-            "unit": self.unit,
-            "false_alarm": self.settings.false_alarm,
-            "confidence": 1.0 - self.settings.false_alarm,
-            "detect": self.settings.detect,
-            "power": self.settings.power,
-            "tolerance": self.settings.tolerance,
-            "allow": self.settings.allow,
-            "failures": [[failure.run, failure.step, failure.reason] for failure in self.failures],
-            "answers": [vars(answer) for answer in self.answers],
-            "p_value": self.p_value,
-            "left_out_steps": list(self.left_out_steps),
-        }
-        numbers |= dictionary.scale_numbers(self.scale) | dictionary.lost_numbers(self.lost, self.settings.lost)
-        numbers |= dictionary.location_numbers(self.location) | self._of_axes() | dictionary.bias_numbers(self.bias)
-        numbers |= dictionary.shape_numbers(self.shape) | dictionary.tails_numbers(self.tails)
-        numbers |= (
-            dictionary.innovations_numbers(self.innovations)
-            | dictionary.accuracy_numbers(self.accuracy)
-            | self._of_map()
-        )
-        if self.landmarks is not None:
-            numbers["landmarks"] = list(self.landmarks)
-        numbers |= dictionary.joint_numbers(self.joint) | dictionary.rejection_numbers(self.rejection)
-        numbers |= dictionary.ends_numbers(self.ends) | dictionary.skipped_numbers(self.skipped)
-        if self.guesses:
-            numbers["guesses"] = {kind: guess._asdict() for kind, guess in self.guesses.items()}
-        numbers |= dictionary.truth_numbers(self.truth) | dictionary.group_numbers(self.by_group)
-        if of_parts := {name: part.by_group for name, part in self.parts.items() if part.by_group is not None}:
-            numbers["by_part"] = {name: dictionary.group_numbers(by)["by"] for name, by in of_parts.items()}
-        if self.convention is not None or self.notes:
-            numbers |= {"convention": self.convention, "align": self.align, "notes": list(self.notes)}
-        if self.world is not None:
-            numbers["world"] = self.world.as_dictionary()
-        return numbers
+        return _statistics_of(self)
 
     def as_dictionary(self) -> dict[str, Any]:
         """Status, reasons and statistics."""
         return {"status": self.status, "reasons": self.reasons, "statistics": self.statistics}
-
-    def _of_axes(self) -> dict[str, Any]:
-        if self.axes is None:
-            return {}
-        from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
-
-        numbers = dictionary.axes_numbers(self.axes) | {"impossible": [list(pair) for pair in self.impossible]}
-        for key, axis in (("worst_axis", self.worst_axis), ("axis", self.axis)):
-            if axis is not None:
-                numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
-        if self.axes.largest is not None:
-            numbers |= {"largest": tuple(self.axes.largest), "largest_direction": self.axes.direction}
-        return numbers
-
-    def _of_map(self) -> dict[str, Any]:
-        if self.map is None:
-            return {}
-        numbers: dict[str, Any] = {
-            "map_ratio": self.map.ratio.value,
-            "map_ratio_interval": tuple(self.map.ratio[1:]),
-            "map_runs": self.map.runs,
-            "map_landmarks": self.map.landmarks,
-            "map_left_out": self.map.left_out,
-        }
-        if self.map.verdict is not None:
-            numbers["map"] = self.map.verdict.as_dictionary()
-        return numbers
 
     def __str__(self) -> str:
         return str(shown_by("verdict_text", self))
@@ -328,3 +268,87 @@ class Verdict(Findings):
         if self.record is None:
             raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
         return shown_by("plot", self.record, self, path)
+
+
+def _axes_numbers(v: Verdict, axes: ComponentRatios) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        "axes": axes.names,
+        "groups": {key: list(index) for key, index in axes.groups.items()},
+        "of_axes": {key: tuple(interval) for key, interval in axes.inflation.items()},
+        "impossible": [list(pair) for pair in v.impossible],
+    }
+    for key, axis in (("worst_axis", v.worst_axis), ("axis", v.axis)):
+        if axis is not None:
+            numbers |= {key: axis[0], f"{key}_ratio": tuple(axis[1])}
+    if axes.largest is not None:
+        numbers |= {"largest": tuple(axes.largest), "largest_direction": axes.direction}
+    return numbers
+
+
+def _guess_numbers(guesses: Mapping[str, ConventionResult]) -> dict[str, Any]:
+    return {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}
+
+
+def _map_numbers(score: MapScore) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        "map_ratio": score.ratio.value,
+        "map_ratio_interval": tuple(score.ratio[1:]),
+        "map_runs": score.runs,
+        "map_landmarks": score.landmarks,
+        "map_left_out": score.left_out,
+    }
+    if score.verdict is not None:
+        numbers["map"] = score.verdict.as_dictionary()
+    return numbers
+
+
+def _statistics_of(v: Verdict) -> dict[str, Any]:
+    """Every number of a verdict; those of parts that could not be computed are left out."""
+    from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
+
+    numbers: dict[str, Any] = {
+        "runs": v.runs,
+        "steps": v.steps,
+        "unit": v.unit,
+        "false_alarm": v.settings.false_alarm,
+        "confidence": 1.0 - v.settings.false_alarm,
+        "detect": v.settings.detect,
+        "power": v.settings.power,
+        "tolerance": v.settings.tolerance,
+        "allow": v.settings.allow,
+        "failures": [[failure.run, failure.step, failure.reason] for failure in v.failures],
+        "answers": [vars(answer) for answer in v.answers],
+        "p_value": v.p_value,
+        "left_out_steps": list(v.left_out_steps),
+    }
+    parts: list[tuple[Any, Callable[[Any], dict[str, Any]]]] = [
+        (v.scale, dictionary.scale_numbers),
+        (v.lost, partial(dictionary.lost_numbers, v.settings.lost)),
+        (v.location, dictionary.location_numbers),
+        (v.axes, partial(_axes_numbers, v)),
+        (v.bias, dictionary.bias_numbers),
+        (v.shape, dictionary.shape_numbers),
+        (v.tails, dictionary.tails_numbers),
+        (v.innovations, dictionary.innovations_numbers),
+        (v.accuracy, vars),
+        (v.map, _map_numbers),
+        (v.landmarks, lambda labels: {"landmarks": list(labels)}),
+        (v.joint, dictionary.joint_numbers),
+        (v.rejection, dictionary.rejection_numbers),
+        (v.ends, dictionary.ends_numbers),
+        (v.skipped, dictionary.skipped_numbers),
+        (v.guesses or None, _guess_numbers),
+        (v.truth, dictionary.truth_numbers),
+        (v.by_group, dictionary.group_numbers),
+    ]
+    for part, numbers_of in parts:
+        if part is not None:
+            numbers |= numbers_of(part)
+    of_parts = {name: dictionary.group_numbers(part.by_group)["by"] for name, part in v.parts.items() if part.by_group}
+    if of_parts:
+        numbers["by_part"] = of_parts
+    if v.convention is not None or v.notes:
+        numbers |= {"convention": v.convention, "align": v.align, "notes": list(v.notes)}
+    if v.world is not None:
+        numbers["world"] = v.world.as_dictionary()
+    return numbers

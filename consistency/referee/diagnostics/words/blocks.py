@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict.parts import TINY, Axes, Interval
+from consistency.referee.diagnostics.verdict.parts import TINY, ComponentRatios, Interval
 from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import off_by
+from consistency.referee.diagnostics.words.numbers import MOST, off_by
 
 BLOCKS = ("position", "attitude", "velocity")
-MOST = 3  # blocks or axes that a sentence names with their figures
 
 
-def ratios_of_blocks(axes: Axes) -> dict[str, Interval]:
+def ratios_of_blocks(axes: ComponentRatios) -> dict[str, Interval]:
     """Ratio of each block whose axes are alike, and of every other axis by itself."""
     ratios, inside = {}, set()
     for block in BLOCKS:
@@ -23,7 +22,7 @@ def ratios_of_blocks(axes: Axes) -> dict[str, Interval]:
     return ratios | {axis: axes.inflation[axis] for axis in axes.names if axis not in inside}
 
 
-def members_of(axes: Axes, block: str) -> list[str]:
+def members_of(axes: ComponentRatios, block: str) -> list[str]:
     """Axes of a block of several; none where the state has no such block."""
     index = axes.groups.get(block, ())
     if block not in BLOCKS or len(index) < 2:
@@ -65,11 +64,11 @@ def unlike_text(v: Findings) -> str:
     if len(right) > MOST and len(right) == len(others):
         texts.append("the others right")
     elif 1 <= len(right) <= MOST:
-        texts.append(f"{listed(right)} right")
+        texts.append(f"{names_in_a_row(right)} right")
     return ", ".join(texts)
 
 
-def listed(names: list[str]) -> str:
+def names_in_a_row(names: list[str]) -> str:
     """A, b and c."""
     *first, last = names
     if not first:

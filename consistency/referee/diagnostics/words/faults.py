@@ -9,9 +9,10 @@ import numpy as np
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
-from consistency.referee.diagnostics.verdict.verdict import Faults, Findings
+from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.blocks import block_text, unlike_ratios, unlike_text
 from consistency.referee.diagnostics.words.numbers import (
+    MOST,
     is_uncertain,
     off_by,
     off_by_factor,
@@ -21,7 +22,6 @@ from consistency.referee.diagnostics.words.numbers import (
 )
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
-MOST = 3  # axes that a sentence names with their figures
 NAMED = 0.1  # part of a unit vector that a sentence names
 
 NamedRatio = tuple[str, Interval]
@@ -30,34 +30,37 @@ NamedRatio = tuple[str, Interval]
 # --- the scale ---------------------------------------------------------------------------------------
 
 
-def scale_text(v: Findings, faults: Faults) -> str:
+def scale_text(v: Findings) -> str:
     """Too small or too large a covariance; '' where a correlation of the wrong sign is all that it is."""
     assert v.scale is not None
     assert v.location is not None
     if v.status == "inconsistent" and v.shape is not None and v.shape.alone:
         return ""
-    if (MAIN not in faults and STEP not in faults) or opposite(v, faults):
+    if (MAIN not in v.faults and STEP not in v.faults) or opposite(v):
         return _axes_text(v)
     if v.status == "inconsistent" and v.scale.inflation.value > 1.0 and _wrong(v, -1):
         return _correlation_text(v)
-    inflation, about = v.scale.inflation, ""
+    inflation = v.scale.inflation
+    about = ""
     if v.bias is not None and v.bias.inflation_without is not None:
-        inflation, about = v.bias.inflation_without, " about the mean"
+        inflation = v.bias.inflation_without
+        about = " about the mean"
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
-    if MAIN not in faults and (contrary or not v.location.lasting):
+    if MAIN not in v.faults and (contrary or not v.location.lasting):
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text, blocks = _size_text(v, inflation, about), ""
+    text = _size_text(v, inflation, about)
+    blocks = ""
     if not about:
         blocks = block_text(v)
     if blocks:
         return f"{text}{_first_visible(v)}: {blocks}"
     text += _where(v) + _first_visible(v)
-    if not about and v.status == "overconfident" and AXIS in faults and not v.settings.one_sided:
+    if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
         text += _contrary_axis(v)
     return text
 
@@ -130,7 +133,8 @@ def _steps_text(v: Findings) -> str:
     """Steps above and below the band, each side with their number, the first, and on the verdict's side the largest."""
     assert v.scale is not None
     assert v.location is not None
-    ratio, (low, high) = v.scale.anees / v.scale.dof, v.location.simultaneous.T / v.scale.dof
+    ratio = v.scale.anees / v.scale.dof
+    (low, high) = v.location.simultaneous.T / v.scale.dof
     own = SIDES.get(v.status, 0)
     signs = [1, -1]
     if own == -1:
@@ -155,15 +159,16 @@ def _steps_text(v: Findings) -> str:
     return f"covariance {', and '.join(parts)}"
 
 
-def opposite(v: Findings, faults: Faults) -> bool:
+def opposite(v: Findings) -> bool:
     """Is the verdict about axes that err in opposite directions?"""
-    return v.status == "inconsistent" and AXIS in faults and bool(_wrong(v, 1)) and bool(_wrong(v, -1))
+    return v.status == "inconsistent" and AXIS in v.faults and bool(_wrong(v, 1)) and bool(_wrong(v, -1))
 
 
 def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
     """Components wrong to one side beyond doubt, the farthest first; groups where no component is."""
     assert v.axes is not None
-    components, groups = [], []
+    components = []
+    groups = []
     for axis, interval in v.axes.inflation.items():
         beyond = interval.low > 1.0
         if sign < 0:
@@ -252,16 +257,19 @@ def _sigmas(value: float) -> str:
     return f"{value:+.1e}"
 
 
-def shape_text(v: Findings, faults: Faults, scale: str = "") -> str:
+def shape_text(v: Findings, scale: str = "") -> str:
     """Two axes whose correlation is shown to be wrong; otherwise the factors of blocks or axes, where these differ.
 
     '' where the sentence on the ``scale`` has these factors.
     """
     assert v.shape is not None
     assert v.axes is not None
-    shape, where, worth_a_word = v.shape, "", VISIBLE
-    if "shape" not in faults:
-        where, worth_a_word = f" in {v.place(shape.step or 1)}", NOTABLE
+    shape = v.shape
+    where = ""
+    worth_a_word = VISIBLE
+    if "shape" not in v.faults:
+        where = f" in {v.place(shape.step or 1)}"
+        worth_a_word = NOTABLE
     gap = abs(shape.actual - shape.stated)
     if shape.shown and shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
@@ -282,9 +290,9 @@ def shape_text(v: Findings, faults: Faults, scale: str = "") -> str:
     return f"unlike factors: {unlike_text(v)}"
 
 
-def tails_text(v: Findings, faults: Faults) -> str:
+def tails_text(v: Findings) -> str:
     """The error that stands out, or that runs differ more than they should."""
-    if "outliers" not in faults:
+    if "outliers" not in v.faults:
         return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
     where = v.run_name(v.tails.run)
@@ -314,7 +322,8 @@ def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> 
 
 def joint_text(v: Findings, joint: JointScore) -> str:
     """What pose and map together say, and which of the two parts stands out, or which landmarks."""
-    pose_is_wrong, map_is_wrong = not joint.pose.holds(1.0), not joint.map.holds(1.0)
+    pose_is_wrong = not joint.pose.holds(1.0)
+    map_is_wrong = not joint.map.holds(1.0)
     part = ""
     if pose_is_wrong and not map_is_wrong:
         part = ", mainly the pose"

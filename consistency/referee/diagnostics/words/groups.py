@@ -8,9 +8,8 @@ from consistency.referee.diagnostics.questions.scale import FEW
 from consistency.referee.diagnostics.records.groups import range_name
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
 from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import is_or_are, off_by, p_text, plural, ratio_text
+from consistency.referee.diagnostics.words.numbers import MOST, is_or_are, off_by, p_text, plural, ratio_text
 
-MOST = 3  # groups, or parts, that a sentence names
 MUCH = 100_000  # runs; more are no advice
 
 
@@ -48,7 +47,8 @@ def _faults(by: ByGroup) -> str:
 
 def _without_fault(by: ByGroup) -> str:
     """What is shown of the groups where none is at fault, and the one that is farthest."""
-    worst, count = by.worst, len(by.groups)
+    worst = by.worst
+    count = len(by.groups)
     if not worst.status:
         return f"groups by {by.column} are reported and not judged"
     right = sum(group.status == "consistent" for group in by.groups)

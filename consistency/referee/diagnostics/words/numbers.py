@@ -5,6 +5,7 @@ from __future__ import annotations
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
+MOST = 3  # axes, blocks, groups or parts that a sentence names
 SMALLEST_P = 1e-6  # below, digits of a p value say nothing
 
 

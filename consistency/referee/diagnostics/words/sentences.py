@@ -12,8 +12,9 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
 from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
-from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Faults, Findings, Verdict
+from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.numbers import (
+    MOST,
     is_or_are,
     p_text,
     percent,
@@ -25,59 +26,67 @@ from consistency.referee.diagnostics.words.numbers import (
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are not advice
 MOST_STEPS = 10_000_000  # of a log; more are not advice
-LATER = "no fault found in the scale; the other questions are asked at the next look"
 
 
-def reasons(v: Findings, first: str = "") -> list[str]:
-    """First the sentence, then the figures.
-
-    Parameters
-    ----------
-    first : sentence in place of the first one, which is then not that of the findings
-    """
-    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
-    sentence, figures = _sentence_and_figures(v, faults)
+def reasons(v: Findings) -> list[str]:
+    """First the sentence, then the figures."""
+    sentence, figures = _sentence_and_figures(v)
     failures = _failures(v)
     lines = [*failures, sentence, *figures]
-    if faults:
+    if v.faults:
         lines = ["; ".join([sentence, *failures]), *figures]
     if v.innovations is not None:
         lines.append(_nis(v.innovations))
     lines += [*details(v), *_first_steps(v)]
-    if not first:
-        first = lines[0]
-        if v.skipped is not None:
-            first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
+    first = lines[0]
+    if v.later:
+        first = "no fault found in the scale; the other questions are asked at the next look"
+    elif v.unshown:
+        first = _unshown_sentence(v)
+    elif v.skipped is not None:
+        first += f"; without {v.skipped.skip.text} of each {_whole(v)}"
     return [f"{v.status}: {first}", *lines[1:]]
+
+
+def _faults_of_parts(v: Findings) -> str:
+    texts = []
+    for name, part in v.parts.items():
+        if part.faults:
+            sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
+            texts.append(f"{name}: {sentence}")
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
+    return "; ".join(texts)
 
 
 def details(v: Findings) -> list[str]:
     """Figures that a first reading leaves out: credibility indices, and p values of the questions."""
-    faults = {answer.question: answer for answer in v.answers if answer.found and not answer.tolerated}
     lines = []
     if v.accuracy is not None and np.isfinite(v.accuracy.nci):
         lines.append(
             f"noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB (0 if right)"
         )
     if v.answers:
-        lines.append(_questions(v, faults))
+        lines.append(_questions(v))
     return lines
 
 
-def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
+def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
     """The sentence on errors, or without truth on innovations, and the figures behind it."""
     if v.scale is not None and v.scale.judged_steps:
         figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
         figures += _coverage(v)
-        if faults:
+        if v.faults and v.parts:
+            return _faults_of_parts(v), figures
+        if v.faults:
             from consistency.referee.diagnostics.words.fault_sentence import fault_sentence
 
-            return fault_sentence(v, v.scale, faults), figures
+            return fault_sentence(v, v.scale), figures
         return _no_fault(v, v.scale), figures
     if v.scale is not None:
         return "no step has a covariance of full rank to judge", []
     if v.innovations is not None and v.innovations.dof:
-        return _without_truth(v, v.innovations, faults), []
+        return _without_truth(v, v.innovations), []
     return "neither truth nor innovations to judge", []
 
 
@@ -87,16 +96,20 @@ def _sentence_and_figures(v: Findings, faults: Faults) -> tuple[str, list[str]]:
 def _failures(v: Findings) -> list[str]:
     lines = []
     if v.failures:
-        first, count = v.failures[0], len({failure.run for failure in v.failures})
-        runs, where = v.runs, f"{v.unit} {first.run}"
+        first = v.failures[0]
+        count = len({failure.run for failure in v.failures})
+        runs = v.runs
+        where = f"{v.unit} {first.run}"
         if v.landmarks is not None:  # of a map, which failed runs do not have
-            runs, where = runs + count, f"{where} in step {first.step}"
+            runs += count
+            where += f" in step {first.step}"
         elif v.unit == "run" and first.step > 1:  # without any estimate its step may be unknown
             where += f" in {v.place(first.step)}"
         lines.append(f"{count} of {runs} {v.unit}s failed, first {where}: {first.reason}")
     if v.impossible:
         row, step = v.impossible[0]
-        count, have = len({run for run, _ in v.impossible}), "have"
+        count = len({run for run, _ in v.impossible})
+        have = "have"
         if count == 1:
             have = "has"
         lines.append(
@@ -132,7 +145,8 @@ def _first_steps(v: Findings) -> list[str]:
         ]
     if v.location is None or v.location.until is None:
         return []
-    until, where = v.location.until, "the first step"
+    until = v.location.until
+    where = "the first step"
     if until.step > 1:
         where = f"the first {until.step} steps"
     return [
@@ -144,8 +158,11 @@ def _first_steps(v: Findings) -> list[str]:
 
 def _no_fault(v: Findings, s: Scale) -> str:
     """Whether the ratio is shown to be right, with that of the worst axis; and what share of lost runs stays open."""
-    shown, runs = s.equivalence, plural(v.runs, v.unit)
-    none, size, axis = "no fault found", f"covariance ratio {_ratio_of_test(s)}", ""
+    shown = s.equivalence
+    runs = plural(v.runs, v.unit)
+    none = "no fault found"
+    size = f"covariance ratio {_ratio_of_test(s)}"
+    axis = ""
     if v.status == "failed":
         none = "no other fault found"
     if any(answer.tolerated for answer in v.answers):
@@ -194,7 +211,10 @@ def _lost(v: Findings) -> str:
     """Lost runs, and the share of them that is shown or not excluded."""
     if v.lost is None or not _has_lost(v):
         return ""
-    lost, asked, unit, some = v.lost, v.settings.lost, v.unit, ""
+    lost = v.lost
+    asked = v.settings.lost
+    unit = v.unit
+    some = ""
     if lost.count:
         some = f"{plural(lost.count, unit)} of {lost.runs} {is_or_are(lost.count)} lost"
     if asked is not None and lost.upper <= asked:
@@ -258,7 +278,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         )
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
-    worst, of_all = clear(v.worst_axis), ratio_text(s.inflation)
+    worst = clear(v.worst_axis)
+    of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
         lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
@@ -370,21 +391,21 @@ def _coverage(v: Findings) -> list[str]:
     return [f"2-sigma coverage {', '.join(known)} ({100 * TWO_SIGMA:.1f} % expected)"]
 
 
-def _without_truth(v: Findings, i: Innovations, faults: Faults) -> str:
+def _without_truth(v: Findings, i: Innovations) -> str:
     if not i.judged:
         return (
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
             "filter are neither white nor of the stated size even if it is right"
         )
     parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
-    if "innovation scale" in faults:
+    if "innovation scale" in v.faults:
         from consistency.referee.diagnostics.words.faults import innovations_text
 
         parts.append(innovations_text(v, i, "they are"))
-    if "innovation whiteness" in faults:
+    if "innovation whiteness" in v.faults:
         parts.append("they are correlated over steps")
     shown = i.equivalence
-    if not faults and shown is not None:
+    if not v.faults and shown is not None:
         is_shown = "is not shown to be"
         if shown.shown:
             is_shown = "is shown to be"
@@ -406,14 +427,17 @@ def _nis(i: Innovations) -> str:
     return text
 
 
-def _questions(v: Findings, faults: Faults) -> str:
+def _questions(v: Findings) -> str:
     text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
     if len(v.answers) > 1:
         text += " together"
-    if not faults:
+    if not v.faults:
         least = min(v.answers, key=lambda answer: answer.adjusted)
         return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
-    found = (f"{question_text(v, q)} (p {p_text(answer.adjusted)})" for q, answer in faults.items())
+    found = []
+    for answer in v.answers:
+        if answer.question in v.faults:
+            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
     return f"{text}; found: {', '.join(found)}"
 
 
@@ -427,14 +451,14 @@ def question_text(v: Findings, question: str) -> str:
 # --- where nothing is decided ----------------------------------------------------------------------------
 
 
-def unshown_sentence(found: Findings, why: str) -> str:
+def _unshown_sentence(v: Findings) -> str:
     """Why nothing can be shown, and the ratio that would be judged."""
-    assert found.scale is not None
+    assert v.scale is not None
     provided = " if they are"
-    if found.truth is not None:
+    if v.truth is not None:
         provided = ""
-    ratio = f"the covariance ratio would be {ratio_text(found.scale.inflation)}{provided}, reported and not judged"
-    return f"{why}; {ratio}"
+    ratio = f"the covariance ratio would be {ratio_text(v.scale.inflation)}{provided}, reported and not judged"
+    return f"{v.unshown}; {ratio}"
 
 
 def other_ways(status: str, record: Record) -> list[str]:
@@ -452,7 +476,8 @@ def sentences_of_conventions(
     found: Mapping[str, ConventionResult], verdicts: Mapping[str, Verdict], settings: Settings
 ) -> list[str]:
     """Which conventions of the error are not rejected, and the sentence of each."""
-    left, gone = [], []
+    left = []
+    gone = []
     for kind, result in found.items():
         if result.possible:
             left.append(f"{kind} (covariance ratio {ratio_text(result.ratio)})")

@@ -12,8 +12,8 @@ from numpy.testing import assert_array_equal, assert_equal
 from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import text_blocks
-from consistency.referee.readers.formats.number_lines import read_numbers
 from consistency.referee.readers.formats.sheet import read_sheet
+from consistency.referee.readers.formats.text_blocks import read_numbers
 from consistency.referee.readers.runs_to_record import symmetric
 
 LAYOUT = "t and two numbers"

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.number_lines import Lines, read_rows
 from consistency.referee.readers.formats.pose_covariances import BLOCKS, covariances_in
 from consistency.referee.readers.formats.rotations import are_rotations, not_unit, quaternions
+from consistency.referee.readers.formats.text_blocks import Lines, read_rows
 
 
 def test_a_reflection_and_what_is_not_finite_are_no_rotations():

@@ -105,8 +105,9 @@ def test_steps_of_few_runs_are_left_out(rng):
 @pytest.mark.parametrize("here, steps, looks", [(slice(None), 10, 6), (slice(4, 5), 10, 12), (slice(4, 5), 1, 120)])
 def test_pairs_are_corrected_for_their_number_and_that_of_steps(monkeypatch, here, steps, looks):
     """Of 4 axes and 10 steps; a single step, chosen among all, shares the rate with whole runs."""
-    known = SimpleNamespace(error=np.zeros((9, 10, 4)), covariance=np.zeros((9, 10, 4, 4)))
-    sample = SimpleNamespace(dof=4, known_errors=known, counted=np.ones((9, 10), bool))
+    sample = SimpleNamespace(
+        dof=4, error=np.zeros((9, 10, 4)), covariance=np.zeros((9, 10, 4, 4)), counted=np.ones((9, 10), bool)
+    )
     for p, shown in ((0.0099 / looks, True), (0.0101 / looks, False)):
         of_steps = {10: np.ones((4, 4)), 1: np.ones((4, 4)), steps: np.full((4, 4), p)}
         monkeypatch.setattr(error_parts, "pair_p_values", lambda error, *_, known=of_steps: known[error.shape[1]])

@@ -13,8 +13,8 @@ from consistency.referee.diagnostics.records.groups import on_steps
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.formats.number_lines import bounded
 from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof
+from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
 

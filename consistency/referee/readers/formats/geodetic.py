@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.number_lines import Lines, increasing
-from consistency.referee.readers.formats.text_blocks import LineParser, parsed
+from consistency.referee.readers.formats.text_blocks import LineParser, Lines, increasing, parsed
 from consistency.referee.types import Array
 
 A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)

@@ -13,10 +13,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
 from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
-from consistency.referee.readers.formats.number_lines import bounded
 from consistency.referee.readers.formats.other_names import with_clock
 from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order
+from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array
 

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
-from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.rotations import are_rotations
 from consistency.referee.readers.formats.sheet import TableRows
+from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.types import Array
 
 EXAMPLE = "2011-09-26 13:02:25.594360375"

@@ -15,11 +15,11 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
 from consistency.referee.readers.formats.named_columns import TRUE, clock_of, places_of
-from consistency.referee.readers.formats.number_lines import increasing
 from consistency.referee.readers.formats.other_names import covariance_places, state_places
 from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.formats.table_columns import LOWER_NAMES
+from consistency.referee.readers.formats.text_blocks import increasing
 from consistency.referee.types import Array
 
 

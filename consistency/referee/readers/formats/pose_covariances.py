@@ -12,8 +12,8 @@ from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.named_columns import numbered
-from consistency.referee.readers.formats.number_lines import Lines, read_numbers
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POSE, SPLIT, TRIANGLE
+from consistency.referee.readers.formats.text_blocks import Lines, read_numbers
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.runs_to_record import symmetric

@@ -27,10 +27,9 @@ from consistency.referee.readers.formats.named_columns import (
     roles_of,
     true_roles_of,
 )
-from consistency.referee.readers.formats.number_lines import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.text_blocks import blocks
+from consistency.referee.readers.formats.text_blocks import Lines, blocks, increasing, read_numbers, read_rows
 from consistency.referee.readers.places import refuse
 from consistency.referee.types import Array, Indices
 

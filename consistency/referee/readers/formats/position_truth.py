@@ -13,7 +13,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import propagated
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.number_lines import Lines
+from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric

@@ -18,10 +18,10 @@ from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_covariances import require_spatial
 from consistency.referee.readers.formats.pose_rows import FULL, POSE
 from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.formats.tum import SpaceRun, poses_of, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at

@@ -17,8 +17,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, one_line, reading, require_name
 from consistency.referee.readers.formats.column_renaming import Columns, renamed
-from consistency.referee.readers.formats.number_lines import bounded, floats
-from consistency.referee.readers.formats.text_blocks import FileRows, LineParser, parsed
+from consistency.referee.readers.formats.text_blocks import FileRows, LineParser, bounded, floats, parsed
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array, Indices
 

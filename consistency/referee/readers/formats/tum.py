@@ -17,7 +17,6 @@ from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.readers.formats.number_lines import Lines
 from consistency.referee.readers.formats.pose_covariances import ORDERS
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
@@ -39,6 +38,7 @@ from consistency.referee.readers.formats.position_truth import (
     require_positions,
 )
 from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric

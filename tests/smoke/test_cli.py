@@ -176,7 +176,7 @@ def test_a_failed_run_is_in_results_verdict_and_report(tmp_path):
     results = cs.run_trials(scenario, [ThrowsInRun7(mark), "ekf-uvd"], runs=12, jobs=1)
     ((name, run, step, reason),) = results.failures.values.tolist()
     assert (name, run, step) == ("throws-in-run-7", 7, 20)
-    assert re.fullmatch(r"RuntimeError: diverged \(test_cli\.py:\d+\)", reason)
+    assert re.fullmatch(r"RuntimeError: diverged \(in update, test_cli\.py:\d+\)", reason)
     verdict = cs.analyse(results)["throws-in-run-7"]
     assert not verdict.consistent
     assert any("1 of 12 runs failed, first run 7 in step 20" in reason for reason in verdict.reasons)

@@ -256,7 +256,7 @@ def test_a_worker_does_what_local_threads_do(linear):
     "error, refusal, fault",
     [
         (cs.InputError("no"), "no", ""),
-        (OSError("no such luck"), "", r"OSError: no such luck \(test_batches.py:\d+\)"),
+        (OSError("no such luck"), "", r"OSError: no such luck \(in refuse, test_batches.py:\d+\)"),
         (ModuleNotFoundError("No module named 'mine'"), "a worker cannot load the work (No module named 'mine')", ""),
     ],
 )

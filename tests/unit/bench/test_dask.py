@@ -130,7 +130,11 @@ def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
     ("error", "raised", "sentence"),
     [
         (cs.InputError("run 5 is not to be"), cs.InputError, r"^run 5 is not to be$"),
-        (OSError("no such luck"), RuntimeError, r"^a worker failed: OSError: no such luck \(test_dask.py:\d+\)$"),
+        (
+            OSError("no such luck"),
+            RuntimeError,
+            r"^a worker failed: OSError: no such luck \(in __call__, test_dask.py:\d+\)$",
+        ),
     ],
 )
 def test_an_error_of_a_worker_is_an_error_here(

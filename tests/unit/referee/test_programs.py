@@ -392,7 +392,8 @@ def test_first_runs_that_fail_alike_end_the_study(place, capsys):
     assert "the first 3 runs failed: it ended with status 127; the log is" in err
     assert len(run_files(place / "out", "run.json")) <= 4
     script(place, "echo libfoo.so not found; [ $1 = 1 ] && kill -TERM $$; exit 1")  # not alike: another one may work
-    status, _, err = monte_carlo("--runs", "6", "--overwrite", "--out", "out", "--", "./filter", "{run}", capsys=capsys)
+    words = ("--runs", "6", "--jobs", "1", "--overwrite", "--out", "out", "--", "./filter", "{run}")
+    status, _, err = monte_carlo(*words, capsys=capsys)
     assert status == 2
     assert "the first 6 runs failed: it ended with status 1" in err
     script(place, "[ $(($1 % 2)) = 1 ] && kill -TERM $$; exit 1")
@@ -529,7 +530,8 @@ def test_a_stopped_study_loses_no_finished_run(number, place, capsys):
     (place / "go").touch()
     resumed = monte_carlo("--resume", *words[2:], capsys=capsys)[1]
     assert resumed == monte_carlo(*["new" if word == "out" else word for word in words[2:]], capsys=capsys)[1]
-    assert "0003-2" in run_files(place / "out", "run.json")
+    if number == signal.SIGKILL:  # otherwise the folder of the run that was stopped may be gone
+        assert "0003-2" in run_files(place / "out", "run.json")
 
 
 def test_files_of_sound_runs_are_deleted(place, capsys):

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 SHOWN = 3  # spans with a panel of errors
 MOST_ROWS = 30  # runs that have a row
+ROW = 0.14  # in, height of one
 MANY = 2000  # errors of motions that are drawn
 CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
@@ -156,9 +157,9 @@ def correction_page(found: Correction) -> Document:
 
 def draw_correction(found: Correction) -> Drawing:
     """Ratios of held-out runs, factors, and coverage."""
-    figure, (runs, factors, coverage) = canvas(2.4, 3, 3)
-    ratios = found.before.ratios, found.after.ratios
     rows = np.linspace(0, len(found.judged) - 1, min(MOST_ROWS, len(found.judged))).round().astype(int)
+    figure, (runs, factors, coverage) = canvas(max(2.4, ROW * len(rows)), 3, 3)
+    ratios = found.before.ratios, found.after.ratios
     draw_ratios(runs, np.array(found.judged)[rows], *(each[rows] for each in ratios))
     log_axis(runs, "x")
     _draw_factors(factors, found)

@@ -77,10 +77,21 @@ def document(rows: Sequence[Row], about: dict[str, str], **facts: Any) -> dict[s
 
 def merged(table: dict[str, Any], rows: Sequence[Row], about: dict[str, str]) -> dict[str, Any]:
     """A table with these rows in place of its own on the same questions in the same worlds."""
-    asked = {(row.question, row.world) for row in rows}
-    others = [row for row in rows_of(table) if (row.question, row.world) not in asked]
+    fresh: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        fresh.setdefault((row.question, row.world), []).append(row)
+    asked = set(fresh)
+    together: list[Row] = []
+    for row in rows_of(table):
+        key = (row.question, row.world)
+        if key in asked:
+            together += fresh.pop(key, [])
+        else:
+            together.append(row)
+    for new in fresh.values():
+        together += new
     facts = {key: table[key] for key in ("seed", "wall_time_s")}
-    return document([*others, *rows], table["worlds"] | table["questions"] | about, **facts)
+    return document(together, table["worlds"] | table["questions"] | about, **facts)
 
 
 def rows_of(table: dict[str, Any]) -> list[Row]:

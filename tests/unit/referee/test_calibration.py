@@ -70,6 +70,11 @@ def test_rows_of_one_module_take_the_place_of_their_questions_in_their_worlds():
     assert again["worlds"] == table["worlds"]
     beside = calibration_rows.merged(TABLE, [replace(new, question=old.question)], {"a new world": "it"})
     assert [row for row in calibration_rows.rows_of(beside) if row.world != "a new world"] == list(ROWS)
+    last = ROWS[-1]
+    asked = [row for row in ROWS if (row.question, row.world) == (last.question, last.world)]
+    assert calibration_rows.rows_of(calibration_rows.merged(TABLE, [*asked, new], {})) == [*ROWS, new]
+    first = [row for row in ROWS if (row.question, row.world) == (old.question, old.world)]
+    assert calibration_rows.rows_of(calibration_rows.merged(TABLE, first, {}))[0] == old  # in its place
 
 
 def test_every_question_and_world_of_the_table_is_explained():

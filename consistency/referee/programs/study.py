@@ -25,7 +25,7 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
 from consistency.referee.programs.process import Processes, Stopped, run_program
-from consistency.referee.programs.study_folder import new_folder, opened, require_usable, write_manifest
+from consistency.referee.programs.study_folder import new_folder, opened_study, require_usable, write_manifest
 from consistency.referee.programs.words import OF_A_RUN, Program, seed_of
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.program_runs import (
@@ -116,7 +116,7 @@ def run_study(
             f"consistency: no word of the command holds {what}; runs then differ only if the program reads it by itself"
         )
     about = _manifest(program, plan, estimates, r)
-    with opened(out, about, resume) as study:
+    with opened_study(out, about, resume) as study:
         loop = _Loop(program, plan, study, r, about)
         loop.do_runs()
         records, verdicts = loop.judged()

@@ -60,7 +60,7 @@ def _is_begun(folder: Path) -> bool:
 
 
 @contextmanager
-def opened(folder: Path, manifest: Mapping[str, Any], resume: bool) -> Iterator[ProgramStudy]:
+def opened_study(folder: Path, manifest: Mapping[str, Any], resume: bool) -> Iterator[ProgramStudy]:
     """The folder with its manifest, locked; without ``resume`` runs that it held are removed.
 
     Raises

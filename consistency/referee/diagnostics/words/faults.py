@@ -10,7 +10,6 @@ from consistency.referee.diagnostics.judging.error_parts import VISIBLE
 from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
 from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
 from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.blocks import block_text, unlike_ratios, unlike_text
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
     is_uncertain,
@@ -20,6 +19,7 @@ from consistency.referee.diagnostics.words.numbers import (
     ratio_text,
     short,
 )
+from consistency.referee.diagnostics.words.unlike_factors import block_text, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 NAMED = 0.1  # part of a unit vector that a sentence names

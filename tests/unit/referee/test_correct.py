@@ -15,6 +15,7 @@ from consistency.referee.fit_covariance.correct import are_needed, correct, fit_
 from consistency.referee.fit_covariance.factors import Block, Factors, blocks_of, fit_alone, fit_factors, run_moments
 from consistency.referee.fit_covariance.floors import fit_runs, likeness, relative_sizes, scores
 from consistency.referee.fit_covariance.intervals import chance_of_one, floor_interval, interval_of_ratio
+from consistency.referee.fit_covariance.scoring import Score, maximise
 from consistency.referee.types import Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -444,3 +445,17 @@ def test_more_runs_than_those_judged_would_decide():
     found = cs.correct(errors, np.broadcast_to(np.eye(3), (40, 100, 3, 3)))
     assert found.status == "undecided"
     assert found.needed > 40
+
+
+# --- scoring ---------------------------------------------------------------------------------------
+
+
+def test_steps_that_lead_beyond_the_top_are_halved():
+    """Newton's method from 0 diverges on -sqrt(1 + (x - 3)^2): its first step ends at 30."""
+
+    def score(theta):
+        away = theta[0] - 3.0
+        root = np.sqrt(1.0 + away**2)
+        return Score(-root, np.array([-away / root]), np.array([[root**-3]]))
+
+    assert maximise(score, np.zeros(1), 0.0, 1e-12) == pytest.approx(3.0, abs=1e-4)

@@ -59,17 +59,24 @@ class Journal:
         self._checkpoint = time.monotonic()
         with self._faults():
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
-            # exclusive before WAL: then SQLite needs no shared memory, which network disks lack
-            self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
-            self._database.executescript(SCHEMA)
-            rows = self._database.execute("SELECT content FROM study").fetchall()
-            self.study: dict[str, Any] = json.loads(rows[0][0]) if rows else {}
-            finished = self._database.execute("SELECT run, notes FROM finished").fetchall()
+            try:
+                self._prepare()
+                rows = self._database.execute("SELECT content FROM study").fetchall()
+                finished = self._database.execute("SELECT run, notes FROM finished").fetchall()
+                self.study: dict[str, Any] = json.loads(rows[0][0]) if rows else {}
+            except BaseException:
+                self._database.close()
+                raise
         self._runs = {run for run, _ in finished}
         self.notes: dict[int, dict[str, Any]] = {run: json.loads(notes) for run, notes in finished if notes}
+
+    def _prepare(self) -> None:
+        # exclusive before WAL: then SQLite needs no shared memory, which network disks lack
+        self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
+        self._database.execute("PRAGMA journal_mode = WAL")
+        self._database.execute("PRAGMA synchronous = NORMAL")
+        self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
+        self._database.executescript(SCHEMA)
 
     @property
     def runs(self) -> set[int]:

@@ -80,16 +80,15 @@ def merged(table: dict[str, Any], rows: Sequence[Row], about: dict[str, str]) ->
     fresh: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         fresh.setdefault((row.question, row.world), []).append(row)
-    asked = set(fresh)
     together: list[Row] = []
     for row in rows_of(table):
         key = (row.question, row.world)
-        if key in asked:
-            together += fresh.pop(key, [])
-        else:
+        if key not in fresh:
             together.append(row)
-    for new in fresh.values():
-        together += new
+        elif fresh[key]:
+            together.append(fresh[key].pop(0))
+    for left in fresh.values():
+        together += left
     facts = {key: table[key] for key in ("seed", "wall_time_s")}
     return document(together, table["worlds"] | table["questions"] | about, **facts)
 

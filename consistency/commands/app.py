@@ -117,8 +117,12 @@ def _end(sentence: str, status: int) -> NoReturn:
 
 
 def _drop_output() -> None:
-    """What standard output could not take goes nowhere; else it would be tried again at the exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    """What a stream could not take goes nowhere; otherwise Python tries again at its end, and ends with status 120."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _open_closed_streams() -> None:

@@ -24,9 +24,8 @@ from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural
 from consistency.referee.document.blocks import Chapter, Document
-from consistency.referee.document.wording import listed
 from consistency.referee.errors import InputError
 from consistency.referee.pages.judged import clock_of
 from consistency.referee.system.folders import read_manifest
@@ -176,7 +175,7 @@ def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
         return f"{unknown[:1].upper()}{unknown[1:]}."
     statuses = Counter(track.verdict.status for track in tracks)
     counts = [f"{statuses[status]} {status}" for status in STATUSES if statuses[status]]
-    return f"In {len(studies)} worlds, of {len(tracks)} verdicts on a filter {listed(counts)}."
+    return f"In {len(studies)} worlds, of {len(tracks)} verdicts on a filter {names_in_a_row(counts)}."
 
 
 def _status_sentence(status: str, pairs: list[tuple[Track, Study]]) -> str:
@@ -185,7 +184,7 @@ def _status_sentence(status: str, pairs: list[tuple[Track, Study]]) -> str:
         return ""
     if len(names) > LISTED:
         return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
-    return f"{status.capitalize()} ({STATUSES[status]}): {listed(names)}."
+    return f"{status.capitalize()} ({STATUSES[status]}): {names_in_a_row(names)}."
 
 
 def _failure_sentence(studies: Sequence[Study]) -> str:
@@ -208,8 +207,8 @@ def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
     parts = []
     if published:
         counts = [f"{count} {word}" for word, count in published.items()]
-        parts.append(f"Of {plural(published.total(), 'published finding')}, {listed(counts)}.")
+        parts.append(f"Of {plural(published.total(), 'published finding')}, {names_in_a_row(counts)}.")
     if own:
         counts = [f"{count} {'hold' if word == 'holds' else word}" for word, count in own.items()]
-        parts.append(f"Of {plural(own.total(), 'conjecture')} of this project, {listed(counts)}.")
+        parts.append(f"Of {plural(own.total(), 'conjecture')} of this project, {names_in_a_row(counts)}.")
     return " ".join(parts)

@@ -19,6 +19,7 @@ from consistency.bench.sweeps.plan import Cell as GridCell
 from consistency.bench.sweeps.plan import values_of
 from consistency.bench.sweeps.printing import by_verdict
 from consistency.bench.sweeps.regime import Regime
+from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import (
     Block,
     Cell,
@@ -34,7 +35,7 @@ from consistency.referee.document.blocks import (
     table,
 )
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, solid, style
-from consistency.referee.document.wording import brief, listed, number
+from consistency.referee.document.wording import brief, number
 from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
@@ -106,7 +107,7 @@ def answer(regime: Regime) -> str:
     }
     parts = [f"{name} in {count}" for name, count in sorted(good.items(), key=lambda pair: -pair[1])]
     alone = sum(bool(regime.trusted(cell)) for cell in cells)
-    text = f"Of {len(cells)} cells, consistent are {listed(parts)}. In {alone} of them at least one filter is."
+    text = f"Of {len(cells)} cells, consistent are {names_in_a_row(parts)}. In {alone} of them at least one filter is."
     if regime.missing:
         text += f" The sweep is not finished: {regime.missing} of {len(cells) * len(good)} verdicts are missing."
     return text

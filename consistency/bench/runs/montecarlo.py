@@ -206,8 +206,10 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | 
     names = [name_of(f) for f in instances]
     if len(set(names)) < len(names):
         raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+    built_in = filter_names()
     for given, name in zip(filters, names, strict=True):
-        if name in filter_names() and not type(given).__module__.startswith(("builtins", "consistency.")):
+        is_ours = isinstance(given, str) or type(given).__module__.startswith("consistency.")
+        if name in built_in and not is_ours:
             raise InputError(f"filter '{name}': is a built-in filter; give yours another name")
     model = belief.sensor.model
     for filter_ in instances:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,11 +95,6 @@ def p_cell(p: float) -> str:
 def unbroken(text: str) -> str:
     """The text, in which no line ends inside an interval or before %."""
     return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace(" %", "\u00a0%"))
-
-
-def listed(words: Sequence[str]) -> str:
-    """a, b and c."""
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 # --- blocks ------------------------------------------------------------------------------------------

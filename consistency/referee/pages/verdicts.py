@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from consistency.referee.diagnostics.words.numbers import plural, short
+from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
 from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
-from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import Estimator, Judged
 
 FAILURES = (
@@ -54,13 +53,13 @@ def verdicts_caption(study: Judged) -> str:
         text += "; with one run the ANEES is the NEES of that run"
     if study.until_decided:
         when = [f"{track.name} after {plural(track.verdict.runs, 'run')}" for track in study.tracks]
-        text += f", until decided: a verdict is that of the look that decided, {listed(when)}"
+        text += f", until decided: a verdict is that of the look that decided, {names_in_a_row(when)}"
     what = "of true to stated covariance" if study.has_truth else "of the NIS to its degrees of freedom"
     text += f". Shown inside {equivalence_interval(study)}: whether the ratio {what} is shown to lie there"
     if len(study.judged) < len(study.tracks):
         text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
     if own := study.own_errors:
-        text += f". Judged in an error of their own, but for the RMSE: {listed(own)}; see Errors of their own"
+        text += f". Judged in an error of their own, but for the RMSE: {names_in_a_row(own)}; see Errors of their own"
     return f"{text}."
 
 

@@ -5,8 +5,10 @@ import json
 import os
 import shutil
 import signal
+import sqlite3
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +186,21 @@ def test_a_file_that_is_no_database_is_refused(path):
     path.write_bytes(b"run:" + bytes(4096))
     with pytest.raises(cs.InputError, match=r"damaged \(file is not a database\)"):
         Journal(path)
+
+
+def test_a_file_that_is_no_database_is_closed(path, monkeypatch):
+    closed = []
+
+    class Connection(sqlite3.Connection):
+        def close(self):
+            closed.append(path)
+            super().close()
+
+    monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Connection))
+    path.write_bytes(b"run:" + bytes(4096))
+    with pytest.raises(cs.InputError, match="damaged"):
+        Journal(path)
+    assert closed == [path]
 
 
 def test_runs_are_brought_to_disk_now_and_then(path, monkeypatch):

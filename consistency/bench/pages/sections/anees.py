@@ -10,9 +10,9 @@ import numpy as np
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.verdict.answers import STEP
 from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, LIMIT
-from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import wide
 from consistency.referee.show.painting import add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
@@ -131,7 +131,9 @@ def anees_caption(anees: Anees) -> str:
     expected = f"{shared.expected:g}" if shared else DIMENSION
     own = [curve.track.name for curve in anees.curves if curve.own_band]
     extra = (
-        f" Fewer runs carry the curve of {listed(own)}; its wider bands are thin lines in its colour." if own else ""
+        f" Fewer runs carry the curve of {names_in_a_row(own)}; its wider bands are thin lines in its colour."
+        if own
+        else ""
     )
     return (
         f"{what}; {expected} is expected (line). Shaded: the 95 % band of a single step (eq. 17), which is not judged."
@@ -142,7 +144,7 @@ def anees_caption(anees: Anees) -> str:
 def _own(anees: Anees) -> str:
     """Whose NEES is that of another error than the additive one."""
     own = anees.study.own_errors
-    return f" In the filter's own error: {listed(own)}." if own else ""
+    return f" In the filter's own error: {names_in_a_row(own)}." if own else ""
 
 
 def _simultaneous(anees: Anees) -> str:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
+from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, Look
-from consistency.referee.document.wording import listed
 from consistency.referee.pages.judged import wide
 from consistency.referee.show.painting import canvas, dots, log_axis, owned, points, say, stroke
 from consistency.referee.types import Array
@@ -92,7 +92,9 @@ def innovations_caption(study: Study) -> str:
         text += " No filter here declares one: its innovations are reported and not judged."
     elif len(judged) < every:
         declare = "declare" if len(judged) > 1 else "declares"
-        text += f" Only {listed(judged)} {declare} one; the innovations of the others are reported and not judged."
+        text += (
+            f" Only {names_in_a_row(judged)} {declare} one; the innovations of the others are reported and not judged."
+        )
     if every > 1:
         text += " Axes differ between filters."
     if any(map(lags, study.tracks)):

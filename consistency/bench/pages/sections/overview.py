@@ -12,7 +12,7 @@ import numpy as np
 from consistency.bench.pages.sections.anees import anees_curves
 from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
 from consistency.referee.diagnostics.verdict.parts import STATUSES, Interval
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.words.numbers import names_in_a_row, short
 from consistency.referee.document.blocks import (
     Block,
     Column,
@@ -29,7 +29,6 @@ from consistency.referee.document.blocks import (
 )
 from consistency.referee.document.colours import BAND, EXPECTED, solid
 from consistency.referee.document.judged_filters import BRIEF, cells, columns
-from consistency.referee.document.wording import listed
 from consistency.referee.pages.origin import facts
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
@@ -102,7 +101,7 @@ def main_sentence(studies: Sequence[Study]) -> str:
         size = ""
         if known:
             size = f" (x{short(known[0])})" if len(known) == 1 else f" (by x{short(known[0])} to x{short(known[-1])})"
-        parts.append(f"{listed(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
+        parts.append(f"{names_in_a_row(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
     return f"At a baseline of {_baseline(main)}, {'; '.join(parts)}."
 
 

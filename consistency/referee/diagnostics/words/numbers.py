@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
@@ -77,6 +79,13 @@ def is_or_are(count: float) -> str:
     if count == 1:
         return "is"
     return "are"
+
+
+def names_in_a_row(names: Sequence[str]) -> str:
+    """A, b and c; '' without any."""
+    if len(names) < 2:
+        return "".join(names)
+    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def with_subject(name: str, sentence: str) -> str:

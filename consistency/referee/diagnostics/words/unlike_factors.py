@@ -6,7 +6,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.parts import TINY, ComponentRatios, Interval
 from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import MOST, off_by
+from consistency.referee.diagnostics.words.numbers import MOST, names_in_a_row, off_by
 
 BLOCKS = ("position", "attitude", "velocity")
 
@@ -66,14 +66,6 @@ def unlike_text(v: Findings) -> str:
     elif 1 <= len(right) <= MOST:
         texts.append(f"{names_in_a_row(right)} right")
     return ", ".join(texts)
-
-
-def names_in_a_row(names: list[str]) -> str:
-    """A, b and c."""
-    *first, last = names
-    if not first:
-        return last
-    return f"{', '.join(first)} and {last}"
 
 
 def block_text(v: Findings) -> str:

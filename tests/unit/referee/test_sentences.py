@@ -310,3 +310,15 @@ def test_a_shape_in_a_step_says_which(rng):
     assert re.search(
         r"correlation \+0\.9\d, stated \+0\.00, of x and y in step 5$", shape_text(only(verdict, "shape in some step"))
     )
+
+
+# --- components by themselves ------------------------------------------------------------------------------
+
+
+def test_a_sentence_names_three_wrong_components_and_counts_the_rest(rng):
+    axes = ("a", "b", "c", "d", "e")
+    error = 3.0 * independent(rng, 60, 20, 5)
+    record = Record("f", error, identities(error), axes=axes, parts=tuple((k,) for k in range(5)))
+    sentence = judge(record, Settings(false_alarm=SURE)).reasons[0]
+    assert [f"{axis}: covariance too small" in sentence for axis in axes] == [True, True, True, False, False]
+    assert sentence.endswith("; and 2 more")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from bench_trials import SEED, Work, interleaved
 
-from consistency.bench.runs.findings import sibling
+from consistency.bench.runs.experiment_scripts import sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.shipped import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry

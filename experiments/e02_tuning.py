@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import script
+from consistency.bench.runs.reproduce_findings import script
 from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")

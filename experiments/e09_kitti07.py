@@ -25,10 +25,10 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.recorded_log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.diagnostics import anees_interval, chi2_mean_interval

@@ -17,7 +17,8 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
+from consistency.bench.runs.reproduce_findings import OURS
 from consistency.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole

@@ -35,7 +35,7 @@ from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
 
 if TYPE_CHECKING:
-    from consistency.referee.verdicts.sources import Source
+    from consistency.referee.verdicts.judge_sources import Source
 
 
 @reads_files
@@ -92,7 +92,7 @@ def analyse_command(
     """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.verdicts.sources import files_source, judge_all, settings_of, skip_asked
+    from consistency.referee.verdicts.judge_sources import files_source, judge_all, settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -180,7 +180,7 @@ def report_command(
 ) -> None:
     """Write a report as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import files_source, judge_all
+    from consistency.referee.verdicts.judge_sources import files_source, judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -245,12 +245,12 @@ def plan_command(
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof
     elif like is not None:
-        from consistency.bench.runs.sequential import pilots_in
+        from consistency.bench.runs.pilot_runs import pilots_in
 
         pilots = pilots_in(like, filters)
     elif scenario is not None and filters:
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
-        from consistency.bench.runs.sequential import pilots_in_world
+        from consistency.bench.runs.pilot_runs import pilots_in_world
 
         pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)

@@ -84,7 +84,7 @@ def monte_carlo_command(
     from consistency.referee.programs.study import Plan, run_study
     from consistency.referee.programs.words import inputs_of, program_of
     from consistency.referee.readers.pipeline.program_runs import failures_in_words
-    from consistency.referee.verdicts.sources import settings_of, skip_asked
+    from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")

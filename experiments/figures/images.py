@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.pages.sections.exhibits import Exhibit, Source, groups, listing, several, shown, single
+from consistency.bench.pages.sections.published_findings import Exhibit, Source, groups, listing, several, shown, single
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, Look, style
-from consistency.referee.show.painting import curve, dots, log_axis, stroke
+from consistency.referee.show.matplotlib_style import curve, dots, log_axis, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

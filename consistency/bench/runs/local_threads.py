@@ -9,9 +9,9 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.runs.backends.threads import worker_count
+from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import Outcomes, TrialWork
-from consistency.bench.store.trial_rows import RunOutcome
+from consistency.bench.runs.worker_count import worker_count
 
 AHEAD = 2  # runs that wait for each worker, so that none waits for them
 GLANCE = 0.1  # s between looks, for a signal that another thread was given

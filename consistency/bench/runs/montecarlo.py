@@ -11,23 +11,21 @@ from typing import Any, overload
 
 import pandas as pd
 
-from consistency.bench.filters import filter_names, get_filter, usable_names
-from consistency.bench.filters.stepping import error_of, name_of
+from consistency.bench.filters.filter_declarations import name_of, own_errors, resolve_filters
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.batches import ExecutorWorkers
-from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
-from consistency.bench.runs.campaign import Interrupted as Interrupted
+from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.resume_results import PLAN, ResultsPlace, place_for
+from consistency.bench.runs.rounds_of_runs import Campaign
+from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
-from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.tables.toml_tables import UNITS
+from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.log import Log, require_format, write_log
+from consistency.bench.store.recorded_log import Log, require_format, write_log
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of, this_machine
 
@@ -190,44 +188,6 @@ def studied(
 def _known(filters: Sequence[Filter]) -> dict[str, Any]:
     """What a resume must have in common, of the filters."""
     return {"filters": [name_of(f) for f in filters], "error": own_errors(filters)}
-
-
-def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | None = None) -> list[Filter]:
-    """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
-    instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
-    if not instances:
-        raise InputError(f"no filter given; known: {', '.join(filter_names())}")
-    for filter_ in instances:
-        if isinstance(filter_, type) or not isinstance(filter_, Filter):
-            hint = (
-                "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
-            )
-            raise InputError(f"{filter_!r} is not a filter: {hint}")
-    names = [name_of(f) for f in instances]
-    if len(set(names)) < len(names):
-        raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
-    built_in = filter_names()
-    for given, name in zip(filters, names, strict=True):
-        is_ours = isinstance(given, str) or type(given).__module__.startswith("consistency.")
-        if name in built_in and not is_ours:
-            raise InputError(f"filter '{name}': is a built-in filter; give yours another name")
-    model = belief.sensor.model
-    for filter_ in instances:
-        require_name(name_of(filter_), "filter")
-        error_of(filter_)
-        sensors = getattr(filter_, "sensors", None)
-        if sensors is not None and model not in sensors:
-            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
-            raise InputError(
-                f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
-                f"filters that fit: {', '.join(fitting)}"
-            )
-        for key in getattr(filter_, "needs", ()):
-            if getattr(belief.sensor, key) is None:
-                unit = f"{key}{UNITS.get(key, '')}"
-                place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
-                raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
-    return instances
 
 
 def simulate_log(

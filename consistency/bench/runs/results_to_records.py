@@ -25,7 +25,7 @@ from consistency.referee.geometry.conventions import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line
 from consistency.referee.readers.formats.innovation_files import NisLog, checked_dof, choose
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Source
+from consistency.referee.verdicts.judge_sources import Source
 
 INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
 POINT = ("x", "y", "z")

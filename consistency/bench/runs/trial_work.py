@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any, Protocol
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.memory_needed import workers_that_fit
+from consistency.bench.runs.missing_kernels import compile_all
+from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
+from consistency.bench.runs.worker_count import workers_that_fit
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.bench.types import Trial
 
 Outcomes = Generator[RunOutcome, None, None]

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from consistency.bench.scenario import Scenario, explain
 from consistency.bench.store.folder_tables import require_unchanged, write_tables
 from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
-from consistency.bench.store.results_check import require_manifest, require_rows
+from consistency.bench.store.results_folder_faults import require_manifest, require_rows
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR

@@ -14,9 +14,9 @@ from typing import Any
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.sweeps.axes import Axis
-from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
+from consistency.bench.sweeps.run_cell import CellOutcome, CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.sweep_axes import Axis
+from consistency.bench.sweeps.sweep_file import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
 from consistency.referee.system.atomic import write_whole
@@ -28,7 +28,7 @@ CELLS = "cells"  # folder of the cells in that of the sweep
 # rooms whose code the numbers of a cell depend on
 CODE = (
     "referee/diagnostics", "referee/geometry", "referee/verdicts", "bench/filters", "bench/models",
-    "bench/runs/sequential.py", "bench/scenario", "bench/simulation", "bench/store",
+    "bench/runs/run_outcome.py", "bench/runs/run_until_decided.py", "bench/scenario", "bench/simulation", "bench/store",
 )  # fmt: skip
 
 

@@ -10,17 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.stepping import name_of
+from consistency.bench.filters.filter_declarations import name_of, resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
-from consistency.bench.store.log import Log
-from consistency.bench.tuning.fit import FactorFit, maximise
+from consistency.bench.store.recorded_log import Log
+from consistency.bench.tuning.fit_and_verdict_trials import parts_of
+from consistency.bench.tuning.innovation_likelihood import BeliefScorer, require_scorable
+from consistency.bench.tuning.noise_factor_fit import FactorFit, maximise
 from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded, scaled
-from consistency.bench.tuning.result import Factor, Setting, Tuning
-from consistency.bench.tuning.scores import BeliefScorer, require_scorable
-from consistency.bench.tuning.split import parts_of
+from consistency.bench.tuning.tuning_result import Factor, Setting, Tuning
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict

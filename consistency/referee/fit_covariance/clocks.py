@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import inverse, log, matrices
+from consistency.referee.geometry.lie_groups import inverse, log, matrices
 from consistency.referee.readers.clock_offset import MOST, REACH
 from consistency.referee.readers.truth_matching import Poses, truth_at
 from consistency.referee.types import Array

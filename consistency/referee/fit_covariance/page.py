@@ -20,7 +20,7 @@ from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.fit_covariance.white_noise import nees_of
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     canvas,
     curve,
     dots,

@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.motion_windows import (
 from consistency.referee.fit_covariance.refusals import RotationGrowth
 from consistency.referee.fit_covariance.systematic_errors import FORWARD, jacobian_of_mean, normal_equations
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
-from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.readers.pipeline.relative_motions import BENT
 from consistency.referee.types import Array, Indices
 

@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.motion_windows import (
     rotation_vectors,
 )
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, no_mean
-from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.types import Array, Indices
 
 CUT = 0.05  # share of windows with a jump

@@ -17,7 +17,7 @@ from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Source
+from consistency.referee.verdicts.judge_sources import Source
 
 
 def record_of_checked(

@@ -11,11 +11,11 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural, with_subject
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
-from consistency.referee.pages import questions, verdicts
-from consistency.referee.pages.by_axis import by_axis
-from consistency.referee.pages.by_group import by_group
-from consistency.referee.pages.judged import Estimator, Judged, clock_of
-from consistency.referee.pages.origin import facts
+from consistency.referee.pages import questions_table, verdicts
+from consistency.referee.pages.judged_estimators import Estimator, Judged, clock_of
+from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.pages.ratio_by_axis import by_axis
+from consistency.referee.pages.ratio_by_group import by_group
 from consistency.referee.pages.record_figures import record_figures
 
 
@@ -41,7 +41,7 @@ def compose_files(
         for i, (name, verdict) in enumerate(judged.items())
     ]
     blocks = (
-        *verdicts.judgement(study), *questions.diagnosis(study), *by_axis(study),
+        *verdicts.judgement(study), *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))

@@ -20,9 +20,9 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, solid, style
 from consistency.referee.errors import InputError
-from consistency.referee.pages.judged import Clock, clock_of, wide
+from consistency.referee.pages.judged_estimators import Clock, clock_of, wide
 from consistency.referee.pages.trajectory import shown_run, trajectory_panel
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     WIDTH,
     add_legend,
     band,

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
-from consistency.referee.show.painting import dots, make_map, path
+from consistency.referee.show.matplotlib_style import dots, make_map, path
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
 from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
-from consistency.referee.pages.judged import Estimator, Judged
+from consistency.referee.pages.judged_estimators import Estimator, Judged
 
 FAILURES = (
     Column("Filter", width="1.4fr"),

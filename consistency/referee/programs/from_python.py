@@ -16,7 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.programs.study import Plan, run_study
 from consistency.referee.programs.words import inputs_of, program_of
 from consistency.referee.readers.options import Reading
-from consistency.referee.verdicts.sources import settings_of, skip_asked
+from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
 FOR_PLAN = ("until_decided", "max_runs", "seed", "jobs", "timeout", "check_seed", "keep", "optimal_gain")
 

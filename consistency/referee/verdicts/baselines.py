@@ -22,7 +22,7 @@ from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import Source, skip_asked, source_of
+from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Mount, PicturedSensor, read_table
-from consistency.bench.store.log import Log, SensorFile, read_log, table_file
+from consistency.bench.store.recorded_log import Log, SensorFile, read_log, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation

@@ -13,7 +13,7 @@ import numpy as np
 
 from consistency.bench.scenario import PicturedSensor, toml_text
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
-from consistency.bench.store.log import sensor_keys
+from consistency.bench.store.recorded_log import sensor_keys
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import p_text

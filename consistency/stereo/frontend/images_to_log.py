@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Belief
 from consistency.bench.store.folder_tables import write_tables
-from consistency.bench.store.log import write_log
+from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free

@@ -11,8 +11,8 @@ from scipy import stats
 
 from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
 from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
-from consistency.referee.pages.origin import facts
-from consistency.referee.show.painting import add_legend, band, canvas, dots, log_axis, stroke
+from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.show.matplotlib_style import add_legend, band, canvas, dots, log_axis, stroke
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 from consistency.stereo.characterising.sensor_text import counted, interval, sentences

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import planar, point, stereo
 from consistency.bench.scenario import Belief, BelievedSensor
-from consistency.bench.store.log import Log
+from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap

@@ -10,7 +10,7 @@ from collections.abc import Sequence as Ordered
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.relative_motion import (

@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockError

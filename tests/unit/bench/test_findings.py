@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from consistency import InputError
-from consistency.bench.runs import findings as module
-from consistency.bench.runs.findings import Study, reproduce
+from consistency.bench.runs import reproduce_findings as module
+from consistency.bench.runs.reproduce_findings import Study, reproduce
 
 SCRIPT = '''"""A question."""
 import os

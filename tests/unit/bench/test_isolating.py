@@ -22,12 +22,12 @@ from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is
 from threadpoolctl import threadpool_info
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
-from consistency.bench.runs.gather import Gathered
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.isolation import filter_process
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.store.trial_rows import outcome_of
+from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.runs.run_outcome import outcome_of
 from consistency.bench.types import Control, Observation
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")

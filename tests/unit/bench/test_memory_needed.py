@@ -3,11 +3,11 @@
 import pytest
 
 import consistency as cs
-from consistency.bench.runs import memory_needed as module
+from consistency.bench.runs import worker_count as module
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
-from consistency.bench.runs.memory_needed import memory_here, workers_that_fit
 from consistency.bench.runs.trial_work import Recorded, TrialWork
+from consistency.bench.runs.worker_count import memory_here, workers_that_fit
 from consistency.referee.errors import InputError
 
 

@@ -10,7 +10,7 @@ import pytest
 from misbehaving import Still, raises
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.results import joined
 from consistency.bench.types import Trial

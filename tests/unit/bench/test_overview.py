@@ -9,7 +9,7 @@ import pytest
 from painted import lines, panels
 
 import consistency as cs
-from consistency.bench.pages.build import answer, build_report, compose
+from consistency.bench.pages.results_report import answer, build_report, compose
 from consistency.bench.pages.sections import overview
 from consistency.bench.pages.sections.report_input import STEREO
 from consistency.referee.document.blocks import Figure, Name, Status, Table

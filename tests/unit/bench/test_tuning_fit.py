@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.bench.tuning.fit import (
+from consistency.bench.tuning.noise_factor_fit import (
     LIMIT,
     UNITS,
     KnownScores,

@@ -15,11 +15,11 @@ from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.scale import ratio_interval, scale_test, weighted_of
-from consistency.referee.diagnostics.records.groups import Column, column_of, groups_of, on_steps
-from consistency.referee.diagnostics.records.outcome import made_from_errors, selects_on_outcome
+from consistency.referee.diagnostics.records.groups_by_column import Column, column_of, groups_of, on_steps
+from consistency.referee.diagnostics.records.outcome_columns import made_from_errors, selects_on_outcome
 from consistency.referee.diagnostics.statistics.number_of_runs import group_runs, power_of, required_runs
 from consistency.referee.diagnostics.verdict.answers import GROUP, SHARES, shares_of
-from consistency.referee.pages.by_group import by_group
+from consistency.referee.pages.ratio_by_group import by_group
 
 
 def errors(runs=40, steps=20, n=2, seed=1):

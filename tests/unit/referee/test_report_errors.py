@@ -7,7 +7,7 @@ from invariant import Invariant
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.build import build_report
+from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections import anees
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
 from consistency.referee.document.blocks import Name, Quantity, Status, Table

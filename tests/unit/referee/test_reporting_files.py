@@ -16,10 +16,10 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.document.blocks import Details, Figure, Table, Text
 from consistency.referee.pages.files_report import compose_files
-from consistency.referee.pages.judged import clock_of
+from consistency.referee.pages.judged_estimators import clock_of
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, unit_of
 from consistency.referee.pages.trajectory import shown_run
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 RUNS, STEPS = 30, 25
 

@@ -10,9 +10,9 @@ from painted import by_title, legend_of, lines, panels, titles
 from scripts import experiment, figures
 
 import consistency as cs
-from consistency.bench.pages import build
-from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
+from consistency.bench.pages import results_report
+from consistency.bench.pages.results_report import build_report
+from consistency.bench.pages.sections.published_findings import P_VALUE, STATUS, Exhibit, Source, listing, shown
 from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table, Text
 
 images, sensor_issues = figures("images"), figures("sensor_issues")
@@ -70,12 +70,12 @@ def test_chapters_of_scripts_stand_on_paper_as_they_say(tmp_path, monkeypatch):
         return SimpleNamespace(CHAPTER=(name, name.title(), "Entry"), ON_PAPER=on_paper, blocks=lambda _: (Text("x"),))
 
     scripts = {"first": script("first", True), "second": script("second", False)}
-    monkeypatch.setattr(build, "figure_scripts", lambda: scripts)
+    monkeypatch.setattr(results_report, "figure_scripts", lambda: scripts)
     report = build_report(written(tmp_path / "out", {}, ("a",)))
-    first, second = build._of_experiments(report, brief=True)
+    first, second = results_report._of_experiments(report, brief=True)
     assert (first.anchor, first.title, first.link, first.on_paper) == ("first", "First", "Entry", None)
     assert second.on_paper == ()
-    assert [chapter.on_paper for chapter in build._of_experiments(report, brief=False)] == [None, None]
+    assert [chapter.on_paper for chapter in results_report._of_experiments(report, brief=False)] == [None, None]
 
 
 def test_a_listing_writes_text_numbers_and_verdicts():

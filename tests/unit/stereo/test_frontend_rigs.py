@@ -13,7 +13,7 @@ from scene import BASELINE, SIZE, K, drive, texture, write_kitti
 
 import consistency as cs
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
 from consistency.referee.readers.formats.kitti_files import drive_poses

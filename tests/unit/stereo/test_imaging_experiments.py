@@ -8,8 +8,8 @@ from painted import by_title, lines, panels
 from scripts import experiment, figures
 
 import consistency as cs
-from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections.exhibits import shown
+from consistency.bench.pages.results_report import build_report
+from consistency.bench.pages.sections.published_findings import shown
 from consistency.referee.document.blocks import Heading, Table
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.rendered_images.scene import Layer, Scene

@@ -29,9 +29,9 @@ from consistency.referee.document.blocks import (
 )
 from consistency.referee.document.colours import BAND, EXPECTED, solid
 from consistency.referee.document.judged_filters import BRIEF, cells, columns
-from consistency.referee.pages.origin import facts
+from consistency.referee.pages.manifest_facts import facts
 from consistency.referee.pages.verdicts import judgement, method
-from consistency.referee.show.painting import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

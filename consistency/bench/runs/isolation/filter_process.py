@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
+from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
+from consistency.bench.filters.run_filter import reason_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.isolation.process_start import begin, nothing
 from consistency.bench.runs.isolation.worker import Isolated, load, run

@@ -18,7 +18,7 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-from consistency.bench.filters.stepping import RunRecord, reason_of, run_filter
+from consistency.bench.filters.run_filter import RunRecord, reason_of, run_filter
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError

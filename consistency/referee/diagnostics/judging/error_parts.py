@@ -191,7 +191,7 @@ def by_group_of(
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
-    from consistency.referee.diagnostics.records.groups import spans_of
+    from consistency.referee.diagnostics.records.groups_by_column import spans_of
 
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.records.groups_by_column import Groups
 
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}

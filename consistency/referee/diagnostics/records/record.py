@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.records.groups_by_column import Groups
     from consistency.referee.diagnostics.records.skipping import Skip, Skipped
 
 

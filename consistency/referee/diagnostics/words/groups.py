@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.groups import range_name
+from consistency.referee.diagnostics.records.groups_by_column import range_name
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import MOST, is_or_are, off_by, p_text, plural, ratio_text

@@ -1,0 +1,208 @@
+"""From the outcomes of runs, as they come, to results: in memory, or in a folder without holding them."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import astuple, dataclass
+from itertools import pairwise, takewhile
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from consistency.bench.runs.run_outcome import RunOutcome
+from consistency.bench.store.folder_tables import with_tables
+from consistency.bench.store.journal import Journal
+from consistency.bench.store.parquet import OPTIONAL, Columns, Writer, write_table
+from consistency.bench.store.results import JOINT, MAP_NUMBERS, NUMBERS, OWN_NUMBERS, Results, StoredResults, Tables
+from consistency.bench.store.trial_tables import Rejected, noted_table, stacked_table
+from consistency.referee.column_names import COLUMNS
+from consistency.referee.errors import InputError
+from consistency.referee.system.folders import NewFolder
+from consistency.referee.system.provenance import this_machine
+from consistency.referee.system.stopping import away_from_signals
+from consistency.referee.types import Failure
+
+
+class InMemory:
+    """What a :class:`Journal` keeps, in memory."""
+
+    def __init__(self) -> None:
+        self.notes: dict[int, dict[str, Any]] = {}
+        self._parts: dict[int, Mapping[str, Columns]] = {}
+
+    @property
+    def runs(self) -> set[int]:
+        return set(self._parts)
+
+    def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any], /) -> None:
+        if notes:
+            self.notes[run] = dict(notes)
+        self._parts[run] = parts
+
+    def pieces(self, name: str, /) -> Iterator[tuple[int, Columns]]:
+        return ((run, self._parts[run][name]) for run in sorted(self._parts) if name in self._parts[run])
+
+
+class Gathered:
+    """Outcomes of runs of some filters, kept in memory, or where a folder and a journal are given on disk.
+
+    Outcomes come in any order; what is in the journal already counts as theirs. ``errors`` has the convention of each
+    filter's own error, where it is not the additive one; only then are there columns for it. ``previous`` are results
+    to which they are added, of which the runs ``kept`` count.
+
+    Raises
+    ------
+    InputError
+        The previous results are damaged, or not in order of the runs: said before the work, which may take hours.
+    """
+
+    def __init__(
+        self,
+        filters: Sequence[str],
+        errors: Mapping[str, str],
+        new: NewFolder | None = None,
+        journal: Journal | None = None,
+        previous: Tables | None = None,
+        kept: Iterable[int] = (),
+    ) -> None:
+        self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
+        self.errors = dict(errors)
+        for name in ["", *self.filters]:
+            for table in ("estimates", "map") if name else ("truth",):
+                deque(self._before(table, name), maxlen=0)
+        self._now = InMemory() if journal is None else journal
+
+    def add(self, outcome: RunOutcome) -> None:
+        parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
+        parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}
+        parts |= {} if outcome.truth is None else {"truth": outcome.truth}
+        notes: dict[str, Any] = {"failures": [astuple(failure) for failure in outcome.failures]}
+        notes |= {"rejections": outcome.rejections, "machine": outcome.machine}
+        with nullcontext() if self.new is None else self.new.writing():
+            self._now.append(outcome.run, parts, {key: rows for key, rows in notes.items() if rows})
+
+    @property
+    def finished(self) -> set[int]:
+        """Runs that are there, those of before too."""
+        return self._now.runs | self.kept
+
+    def machines(self, before: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+        """Those that computed the runs: the ones ``before``, and the ones of now."""
+        now = self._now.runs - self.kept
+        noted = [self._now.notes.get(run, {}).get("machine", this_machine()) for run in sorted(now)]
+        machines = [*before, *(noted or [this_machine()])]
+        return [machine for i, machine in enumerate(machines) if machine not in machines[:i]]
+
+    def pieces(self, table: str, filter_name: str = "") -> Iterator[Columns]:
+        """Rows of ``estimates`` or ``map`` of a filter, or of ``truth``, run by run in order of the runs."""
+        part = f"{table} {filter_name}" if filter_name else table
+        now = ((run, columns) for run, columns in self._now.pieces(part) if run not in self.kept)
+        merged = heapq.merge(self._before(table, filter_name), now, key=itemgetter(0))
+        return (columns for _, columns in merged if len(columns["run"]))
+
+    def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
+        """The results; a folder is written and put in its place, unless no run is finished."""
+        failures, rejections = self.noted()
+        manifest = manifest | {"failures": len(failures)}
+        if self.new is not None and self.finished:
+            return away_from_signals(self._stored, self.new, manifest, failures, landmarks, rejections)
+        estimates, maps = (
+            [(name, columns) for name in self.filters for columns in self.pieces(table, name)]
+            for table in ("estimates", "map")
+        )
+        truth = [("", columns) for columns in self.pieces("truth")]
+        return Results(
+            stacked_table("estimates", estimates, tuple(OPTIONAL["estimates"]) if self.errors else ()), failures,
+            stacked_table("truth", truth) if truth else None, landmarks, manifest,
+            stacked_table("map", maps, (JOINT,)) if maps else None, rejections,
+        )  # fmt: skip
+
+    def _stored(
+        self, new: NewFolder, manifest: dict[str, Any], failures: pd.DataFrame, landmarks: pd.DataFrame | None,
+        rejections: pd.DataFrame | None,
+    ) -> StoredResults:  # fmt: skip
+        with new.writing():
+            new.path.mkdir(parents=True, exist_ok=True)
+            self._write(new, "estimates", OWN_NUMBERS if self.errors else NUMBERS)
+            self._write(new, "map", MAP_NUMBERS)
+            self._write(new, "truth")
+            for name, table in (("failures", failures), ("landmarks", landmarks), ("rejections", rejections)):
+                if table is not None:
+                    write_table(new.path / f"{name}.parquet", name, table)
+        manifest = with_tables(new, manifest)
+        new.put_in_place(manifest)
+        return StoredResults(new.folder, failures, landmarks, manifest, rejections)
+
+    def _write(self, new: NewFolder, table: str, columns: Sequence[str] = ()) -> None:
+        """A table, one filter after the other; without a row none but ``estimates``."""
+        names = [""] if table == "truth" else self.filters
+        if table != "estimates" and all(next(self.pieces(table, name), None) is None for name in names):
+            return
+        with Writer(new.path / f"{table}.parquet", table, columns) as writer:
+            for name in names:
+                for rows in self.pieces(table, name):
+                    writer.add(rows, filter=name)
+                writer.end_group()
+
+    def _before(self, table: str, filter_name: str) -> Iterator[tuple[int, Columns]]:
+        """The kept runs of the previous results, one by one."""
+        if self.previous is None:
+            return
+        columns = list(COLUMNS["truth"])
+        if table == "map":
+            columns = self.previous.map_numbers
+        elif table == "estimates":
+            columns = OWN_NUMBERS if filter_name in self.errors else NUMBERS
+        last = -1
+        for batch in self.previous.batches(table, columns, filter_name or None):
+            for start, end in pairwise(np.flatnonzero(np.diff(batch["run"], prepend=-1, append=-1))):
+                run = int(batch["run"][start])
+                if run < last:
+                    raise InputError(f"the {table} to resume must be in order of the runs, as they were written")
+                last = run
+                if run in self.kept:
+                    yield run, {name: values[start:end] for name, values in batch.items()}
+
+    def noted(self) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+        """Failures, and rejections where a filter has a guard, of before and of now, by filter and run."""
+        rank, tables = {name: i for i, name in enumerate(self.filters)}, []
+        for key, kind in (("failures", Failure), ("rejections", Rejected)):
+            before: pd.DataFrame | None = None if self.previous is None else getattr(self.previous, key)
+            rows = [] if before is None else [kind(*row) for row in before.itertuples(index=False)]
+            rows = [row for row in rows if row.run in self.kept and row.filter in rank]
+            for run, notes in self._now.notes.items():
+                rows += [kind(*row) for row in notes.get(key, ()) if run not in self.kept]
+            tables.append(noted_table(key, sorted(rows, key=lambda row: (rank[row.filter], row.run))))
+        failures, rejections = tables
+        return failures, rejections if len(rejections) else None
+
+
+@dataclass(frozen=True)
+class SoFar(Tables):
+    """The first runs of what is gathered; the tables are read each time they are asked for, a run at a time."""
+
+    gathered: Gathered
+    runs: int
+    manifest: dict[str, Any]
+    failures: pd.DataFrame
+    landmarks: pd.DataFrame | None
+    rejections: pd.DataFrame | None = None
+
+    @property
+    def has_truth(self) -> bool:
+        return next(self.batches("truth", ["run"]), None) is not None
+
+    @property
+    def has_joint(self) -> bool:
+        return True  # NaN in runs of older results, which lack it
+
+    def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
+        for name in self.filters if filter_name is None and table != "truth" else [filter_name or ""]:
+            for piece in takewhile(lambda piece: piece["run"][0] < self.runs, self.gathered.pieces(table, name)):
+                nothing = np.full(len(piece["run"]), np.nan)
+                yield {column: piece.get(column, nothing) for column in columns}

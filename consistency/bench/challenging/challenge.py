@@ -279,9 +279,9 @@ def challenge_lines(outcome: Challenge, out: Path) -> list[str]:
         tested += f", of which {len(verdict.failures)} broke down"
     world = f"{outcome.space.text(outcome.point)}: ratio {outcome.ratio:.3g} in a typical run of the search"
     if not outcome.found:
-        given = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
+        budget_text = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
         return [
-            f"{name}: no world found within {given} in which it is overconfident",
+            f"{name}: no world found within {budget_text} in which it is overconfident",
             f"  most overconfident: {world}",
             f"  that world: {tested}",
             f"  searched: {searched}; no proof that there is no such world",

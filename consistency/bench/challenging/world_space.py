@@ -190,12 +190,12 @@ def space_of(base: Scenario, within: Sequence[str] = ()) -> Space:
     require_right_belief(base)
     dimensions = {d.name: d for d in _dimensions(base)}
     bounds: list[str] = []
-    for text in within:
-        bounds += _bounds_of_file(text) if text.endswith(".toml") else [text]
-    for text in bounds:
-        name, separator, values = text.partition("=")
+    for bound in within:
+        bounds += _bounds_of_file(bound) if bound.endswith(".toml") else [bound]
+    for bound in bounds:
+        name, separator, values = bound.partition("=")
         if name not in dimensions or not separator:
-            raise InputError(f"--within {text}: give it as NAME=LOW:HIGH with a NAME out of {', '.join(dimensions)}")
+            raise InputError(f"--within {bound}: give it as NAME=LOW:HIGH with a NAME out of {', '.join(dimensions)}")
         dimensions[name] = dimensions[name].within(values)
     return Space(base, tuple(dimensions.values()))
 
@@ -228,27 +228,27 @@ def _dimensions(base: Scenario) -> list[Dimension]:
     """Return the dimensions in which a world may differ from the base."""
     truth = base.truth
     is_uniform, has_laps = isinstance(truth.landmarks, UniformLandmarks), truth.path.shape in SHAPES
-    found: list[Dimension] = []
+    dimensions: list[Dimension] = []
     if isinstance(truth.landmarks, UniformLandmarks):
-        found.append(_choice("seed", truth.landmarks.seed, range(SEEDS)))
-    found.append(_scale("sensor", 1.0, "x"))
+        dimensions.append(_choice("seed", truth.landmarks.seed, range(SEEDS)))
+    dimensions.append(_scale("sensor", 1.0, "x"))
     if truth.motion.sigma_v > 0 or truth.motion.sigma_omega > 0:
-        found.append(_scale("odometry", 1.0, "x"))
-    found.append(_scale("steps", truth.steps, whole=True))
+        dimensions.append(_scale("odometry", 1.0, "x"))
+    dimensions.append(_scale("steps", truth.steps, whole=True))
     if is_uniform:
-        found.append(_choice("path", truth.path.shape, SHAPES))
+        dimensions.append(_choice("path", truth.path.shape, SHAPES))
     if is_uniform and has_laps:
-        found.append(_scale("lap", 1.0, "x"))
+        dimensions.append(_scale("lap", 1.0, "x"))
     if is_uniform:
-        found.append(_scale("density", 1.0, "x"))
-    found.append(_scale("dt", truth.dt, " s"))
+        dimensions.append(_scale("density", 1.0, "x"))
+    dimensions.append(_scale("dt", truth.dt, " s"))
     if isinstance(truth.sensor, UvdSensor):
         (_, _, z), (_, pitch, _) = truth.sensor.mount.position, truth.sensor.mount.rotation
-        found.append(_choice("tilt", round(float(np.rad2deg(pitch)), 6), TILTS, " deg"))
-        found.append(_choice("height", z, HEIGHTS, " m"))
-        found.append(_scale("baseline", truth.sensor.B, " m"))
-    found.append(_scale("range", truth.sensor.range[1], " m"))
-    return found
+        dimensions.append(_choice("tilt", round(float(np.rad2deg(pitch)), 6), TILTS, " deg"))
+        dimensions.append(_choice("height", z, HEIGHTS, " m"))
+        dimensions.append(_scale("baseline", truth.sensor.B, " m"))
+    dimensions.append(_scale("range", truth.sensor.range[1], " m"))
+    return dimensions
 
 
 def _scale(name: str, base: float, unit: str = "", whole: bool = False) -> LogScale:

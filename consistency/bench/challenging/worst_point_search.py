@@ -124,23 +124,25 @@ def _batch(
 ) -> list[ScoredWorld]:
     """New points; the first of all is that of the base."""
     elite = sorted((c for c in tried.values() if c.usable and c.scores), key=lambda c: c.score, reverse=True)[:ELITE]
-    new: dict[Point, ScoredWorld] = {} if tried else {space.plain: ScoredWorld(space.plain)}
+    new_points: dict[Point, ScoredWorld] = {} if tried else {space.plain: ScoredWorld(space.plain)}
     for _ in range(20 * BATCH):  # a small space has no more to offer
-        if len(new) == BATCH:
+        if len(new_points) == BATCH:
             break
-        varied = len(elite) >= 4 and len(new) >= EVEN
-        u = _varied(np.array([space.where(c.point) for c in elite]), rng) if varied else even.random()[0]
-        point = space.at(u)
-        if point not in tried and point not in new:
-            new[point] = ScoredWorld(point)
-    return list(new.values())
+        if len(elite) >= 4 and len(new_points) >= EVEN:
+            place = _varied(np.array([space.where(each.point) for each in elite]), rng)
+        else:
+            place = even.random()[0]
+        point = space.at(place)
+        if point not in tried and point not in new_points:
+            new_points[point] = ScoredWorld(point)
+    return list(new_points.values())
 
 
 def _varied(elite: Array, rng: np.random.Generator) -> Array:
     """A point of the elite (n, d) with some coordinates moved along the difference of two others."""
-    first, second, third = rng.choice(len(elite), 3, replace=False)
-    moved = elite[first] + STEP * (elite[second] - elite[third]) + JITTER * rng.standard_normal(elite.shape[1])
-    taken = rng.random(elite.shape[1]) < CROSSOVER
-    taken |= np.arange(elite.shape[1]) == rng.integers(elite.shape[1])
-    u = np.where(taken, moved, elite[first])
+    base, plus, minus = rng.choice(len(elite), 3, replace=False)
+    moved = elite[base] + STEP * (elite[plus] - elite[minus]) + JITTER * rng.standard_normal(elite.shape[1])
+    is_mutated = rng.random(elite.shape[1]) < CROSSOVER
+    is_mutated |= np.arange(elite.shape[1]) == rng.integers(elite.shape[1])
+    u = np.where(is_mutated, moved, elite[base])
     return np.asarray(1.0 - np.abs(1.0 - np.abs(u) % 2.0))  # reflected at 0 and 1

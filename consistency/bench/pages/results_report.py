@@ -201,10 +201,10 @@ def _failure_sentence(studies: Sequence[Study]) -> str:
 
 
 def _finding_sentence(findings: Sequence[dict[str, Any]]) -> str:
-    said = [outcome(str(finding["source"] or ""), str(finding["verdict"])) for finding in findings]
+    outcome_words = [outcome(str(finding["source"] or ""), str(finding["verdict"])) for finding in findings]
     is_own = [str(finding["source"] or "").startswith(OURS) for finding in findings]
-    own = Counter(word for word, ours in zip(said, is_own, strict=True) if ours)
-    published = Counter(word for word, ours in zip(said, is_own, strict=True) if not ours)
+    own = Counter(word for word, ours in zip(outcome_words, is_own, strict=True) if ours)
+    published = Counter(word for word, ours in zip(outcome_words, is_own, strict=True) if not ours)
     parts = []
     if published:
         counts = [f"{count} {word}" for word, count in published.items()]

@@ -101,15 +101,16 @@ def _regions(regime: Regime) -> list[Chapter]:
 def answer(regime: Regime) -> str:
     """Which filter is consistent in how many cells, in one paragraph."""
     cells = regime.sweep.cells
-    good = {
+    consistent_cells = {
         name: sum(r.status == "consistent" for (_, n), r in regime.results.items() if n == name)
         for name in regime.sweep.filters
     }
-    parts = [f"{name} in {count}" for name, count in sorted(good.items(), key=lambda pair: -pair[1])]
+    parts = [f"{name} in {count}" for name, count in sorted(consistent_cells.items(), key=lambda pair: -pair[1])]
     alone = sum(bool(regime.trusted(cell)) for cell in cells)
     text = f"Of {len(cells)} cells, consistent are {names_in_a_row(parts)}. In {alone} of them at least one filter is."
     if regime.missing:
-        text += f" The sweep is not finished: {regime.missing} of {len(cells) * len(good)} verdicts are missing."
+        wanted = len(cells) * len(regime.sweep.filters)
+        text += f" The sweep is not finished: {regime.missing} of {wanted} verdicts are missing."
     return text
 
 
@@ -130,8 +131,8 @@ def method(regime: Regime) -> str:
 def _summary(regime: Regime) -> Table:
     """Table with a row for each filter: cells by verdict, and the median cost."""
     statuses, rows = by_verdict(regime)
-    heads = (Column(status.capitalize(), HYPHENATED.get(status, ""), number=True) for status in statuses)
-    columns = (Column("Filter", width="3.4cm"), *heads, Column("Cost", number=True))
+    status_columns = (Column(status.capitalize(), HYPHENATED.get(status, ""), number=True) for status in statuses)
+    columns = (Column("Filter", width="3.4cm"), *status_columns, Column("Cost", number=True))
     return table(columns, rows, "Cells by verdict, a row a filter", caption="Cells by verdict, and the median cost.")
 
 
@@ -164,10 +165,10 @@ def _sides(regime: Regime) -> list[GridAxis]:
 
 
 def _trusted(regime: Regime, cell: GridCell) -> Cell:
-    found = regime.trusted(cell)
-    if not found:
+    trusted = regime.trusted(cell)
+    if not trusted:
         return "none"
-    lines = [f"{name}: {number(r.rmse_position, '.3f')} m, ×{number(r.cost, '.2g')}" for name, r in found]
+    lines = [f"{name}: {number(r.rmse_position, '.3f')} m, ×{number(r.cost, '.2g')}" for name, r in trusted]
     return Stack(lines[0], tuple(Small(line) for line in lines[1:]), bold=True)
 
 
@@ -203,14 +204,15 @@ def _along(regime: Regime, side: GridAxis) -> Figure:
     def draw() -> Drawing:
         figure, (ratios, errors) = canvas(2.2, 2, 2)
         for number_of, name in enumerate(regime.sweep.filters):
-            found = results_at(regime, name, [])
-            x = np.array([float(side.values[cell.indices[0]]) for cell, _ in found])
-            look = solid(style(number_of))
-            quantities = ((ratios, [r.ratio for _, r in found]), (errors, [r.rmse_position for _, r in found]))
-            for axes, values in quantities:
-                axes.plot(x, values, label=name, **stroke(look))
-                for place, value, (_, result) in zip(x, values, found, strict=True):
-                    axes.plot(place, value, gid=TITLE + words_of(result), **dots(_marker(result.status, look.colour)))
+            results_along = results_at(regime, name, [])
+            axis_values = np.array([float(side.values[cell.indices[0]]) for cell, _ in results_along])
+            filter_style = solid(style(number_of))
+            for axes, field in ((ratios, "ratio"), (errors, "rmse_position")):
+                values = [getattr(result, field) for _, result in results_along]
+                axes.plot(axis_values, values, label=name, **stroke(filter_style))
+                for axis_value, value, (_, result) in zip(axis_values, values, results_along, strict=True):
+                    marker = _marker(result.status, filter_style.colour)
+                    axes.plot(axis_value, value, gid=TITLE + words_of(result), **dots(marker))
         statuses = dict.fromkeys(result.status for result in regime.results.values())
         for status in statuses:
             ratios.plot([], [], label=status, **dots(_marker(status, "#555555")))
@@ -257,12 +259,12 @@ def views(regime: Regime) -> list[View]:
     """Panels that show all cells; two axes of the grid are their sides, or one and an axis that varies alone."""
     sweep = regime.sweep
     grid = sorted((a for a in sweep.grid if len(a.values) > 1), key=lambda axis: not axis.numeric)
-    found: list[View] = []
+    heat_maps: list[View] = []
     for sides in [[axis, *grid[:1]] for axis in sweep.alone] or [grid[:2] or list(sweep.axes)[:2]]:
         others = [axis for axis in sweep.axes if axis not in sides]
         places = itertools.product(*(range(len(a.values)) if a.home is None else (a.home,) for a in others))
-        found += [(sides, list(zip(others, at, strict=True))) for at in places]
-    return found
+        heat_maps += [(sides, list(zip(others, at, strict=True))) for at in places]
+    return heat_maps
 
 
 def cells_of(regime: Regime, fixed: Sequence[tuple[GridAxis, int]]) -> list[GridCell]:
@@ -279,13 +281,14 @@ def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
 
 def heat_figure(regime: Regime, name: str) -> Figure:
     """Heat maps of one filter, as many drawings as it takes."""
-    found = views(regime)
-    rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in found)
-    widest = max(len(sides[0].values) for sides, _ in found)
-    columns = 1 if len(found) == 1 or widest > WIDEST else 2
-    most = columns * max(1, ROOM // (rows + 2))
+    heat_maps = views(regime)
+    rows = max(len(sides[1].values) if len(sides) > 1 else 1 for sides, _ in heat_maps)
+    widest = max(len(sides[0].values) for sides, _ in heat_maps)
+    columns = 1 if len(heat_maps) == 1 or widest > WIDEST else 2
+    maps_of_drawing = columns * max(1, ROOM // (rows + 2))
     drawings = tuple(
-        partial(_draw_maps, regime, name, found[i : i + most], columns, rows) for i in range(0, len(found), most)
+        partial(_draw_maps, regime, name, heat_maps[i : i + maps_of_drawing], columns, rows)
+        for i in range(0, len(heat_maps), maps_of_drawing)
     )
     caption = (
         f"{name}: ratio of true to stated covariance in each cell, and the verdict; 1 is right, more is overconfident. "
@@ -321,10 +324,10 @@ def _draw_tiles(
         rows = len(sides[1].values)
         axes.set(ylabel=_short(sides[1].key), ylim=(-0.5, rows - 0.5), yticks=range(rows))
         axes.set_yticklabels([wrapped(said(sides[1], i), 16) for i in range(rows)])
-    found = results_at(regime, name, at)
-    if not found:
+    cell_results = results_at(regime, name, at)
+    if not cell_results:
         say(axes, "no cell is there yet")
-    for cell, result in found:
+    for cell, result in cell_results:
         row = cell.indices[places[1]] if len(places) > 1 else 0
         _draw_tile(axes, cell.indices[places[0]], row, result)
 

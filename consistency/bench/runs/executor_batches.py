@@ -117,12 +117,12 @@ class ExecutorWorkers:
         sent: dict[Future[BatchResult], Batch] = {}
         finished = SimpleQueue[Future[BatchResult]]()
         machines: list[dict[str, str]] = []
-        whole = _pickled(work)
+        pickled_work = _pickled(work)
         try:
             while True:
                 while (batch := batches.next()) is not None:
-                    part = work.only(batch.runs)
-                    future = self._submit(whole if part is work else _pickled(part), batch)
+                    work_of_batch = work.only(batch.runs)
+                    future = self._submit(pickled_work if work_of_batch is work else _pickled(work_of_batch), batch)
                     sent[future] = batch
                     future.add_done_callback(finished.put)
                 if not sent:
@@ -261,8 +261,8 @@ def do_batch(pickled: bytes, runs: Sequence[int], seconds: float, number: int) -
         refusal = f"a worker cannot load the work ({error}); install there what is installed here"
     except Exception as error:
         fault = reason_of(error)
-    left = pickle.dumps(outcomes, pickle.HIGHEST_PROTOCOL)
-    return BatchResult(left, socket.gethostname(), this_machine(), versions_here(), refusal, fault)
+    pickled_outcomes = pickle.dumps(outcomes, pickle.HIGHEST_PROTOCOL)
+    return BatchResult(pickled_outcomes, socket.gethostname(), this_machine(), versions_here(), refusal, fault)
 
 
 @cache
@@ -271,9 +271,9 @@ def versions_here() -> dict[str, str]:
     digest = hashlib.sha256()
     for path in sorted(path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")):
         digest.update(path.read_bytes())
-    own = f"{version('filter-consistency')} (sources {digest.hexdigest()[:12]})"
+    package_version = f"{version('filter-consistency')} (sources {digest.hexdigest()[:12]})"
     python = ".".join(platform.python_version_tuple()[:2])  # classes from __main__ are sent as its bytecode
-    return {"filter-consistency": own, "Python": python} | {name: version(name) for name in DECIDING}
+    return {"filter-consistency": package_version, "Python": python} | {name: version(name) for name in DECIDING}
 
 
 def require_same_versions(result: BatchResult) -> None:
@@ -284,8 +284,9 @@ def require_same_versions(result: BatchResult) -> None:
     InputError
         Versions differ; names the host and the first of them.
     """
-    for name, here in versions_here().items():
-        if (there := result.versions.get(name)) != here:
+    for name, version_here in versions_here().items():
+        if (version_there := result.versions.get(name)) != version_here:
             raise InputError(
-                f"the worker on {result.host} has {name} {there}, here it is {here}; install the same version there"
+                f"the worker on {result.host} has {name} {version_there}, here it is {version_here}; install the same "
+                "version there"
             )

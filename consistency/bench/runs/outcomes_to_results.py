@@ -78,13 +78,13 @@ class Gathered:
         self._now = InMemory() if journal is None else journal
 
     def add(self, outcome: RunOutcome) -> None:
-        parts = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
-        parts |= {f"map {name}": columns for name, columns in outcome.maps.items()}
-        parts |= {} if outcome.truth is None else {"truth": outcome.truth}
+        tables = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
+        tables |= {f"map {name}": columns for name, columns in outcome.maps.items()}
+        tables |= {} if outcome.truth is None else {"truth": outcome.truth}
         notes: dict[str, Any] = {"failures": [astuple(failure) for failure in outcome.failures]}
         notes |= {"rejections": outcome.rejections, "machine": outcome.machine}
         with nullcontext() if self.new is None else self.new.writing():
-            self._now.append(outcome.run, parts, {key: rows for key, rows in notes.items() if rows})
+            self._now.append(outcome.run, tables, {key: rows for key, rows in notes.items() if rows})
 
     @property
     def finished(self) -> set[int]:
@@ -93,9 +93,9 @@ class Gathered:
 
     def machines(self, before: Sequence[dict[str, str]]) -> list[dict[str, str]]:
         """Those that computed the runs: the ones ``before``, and the ones of now."""
-        now = self._now.runs - self.kept
-        noted = [self._now.notes.get(run, {}).get("machine", this_machine()) for run in sorted(now)]
-        machines = [*before, *(noted or [this_machine()])]
+        runs_of_now = self._now.runs - self.kept
+        machines_of_runs = [self._now.notes.get(run, {}).get("machine", this_machine()) for run in sorted(runs_of_now)]
+        machines = [*before, *(machines_of_runs or [this_machine()])]
         return [machine for i, machine in enumerate(machines) if machine not in machines[:i]]
 
     def pieces(self, table: str, filter_name: str = "") -> Iterator[Columns]:
@@ -145,8 +145,8 @@ class Gathered:
             return
         with Writer(new.path / f"{table}.parquet", table, columns) as writer:
             for name in names:
-                for rows in self.pieces(table, name):
-                    writer.add(rows, filter=name)
+                for piece in self.pieces(table, name):
+                    writer.add(piece, filter=name)
                 writer.end_group()
 
     def _before(self, table: str, filter_name: str) -> Iterator[tuple[int, Columns]]:

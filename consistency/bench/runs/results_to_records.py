@@ -97,8 +97,8 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
 
 def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
     """Where rows stand among the values of ``runs`` with ``steps`` each: a slice if one comes after the other."""
-    at = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
-    return slice(int(at[0]), int(at[-1]) + 1) if len(at) and (np.diff(at) == 1).all() else at
+    rows = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
+    return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) and (np.diff(rows) == 1).all() else rows
 
 
 def _fill(covariance: Array, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
@@ -126,12 +126,12 @@ def _require_agreement(r: Record) -> None:
         too_large = np.abs(error) > np.sqrt(LARGEST_NUMBER * np.maximum(variance, 0.0))
         return np.asarray(np.isfinite(nees) & (too_large & (variance > 0)).any(axis=-1))
 
-    bad = by_runs(beyond, r.error, r.covariance, r.nees)
-    if bad.any():
-        row, step = np.argwhere(bad)[0]
+    impossible = by_runs(beyond, r.error, r.covariance, r.nees)
+    if impossible.any():
+        run_row, step = np.argwhere(impossible)[0]
         raise InputError(
-            f"estimates of '{r.name}', run {r.run_numbers[row]}, step {step + 1}: the NEES is not that of the error "
-            "and its covariance; the tables were changed or damaged; write them again"
+            f"estimates of '{r.name}', run {r.run_numbers[run_row]}, step {step + 1}: the NEES is not that of the "
+            "error and its covariance; the tables were changed or damaged; write them again"
         )
 
 
@@ -157,8 +157,10 @@ def _require_all(r: Record, column: str, covariance: Array) -> None:
 
 def _first_number(values: Array) -> Array:
     """Column of the first number in each row, the number of columns where none is."""
-    there = np.isfinite(values)
-    return np.where(there.any(axis=1), there.argmax(axis=1), values.shape[1]) if values.size else np.zeros(len(values))
+    is_number = np.isfinite(values)
+    if not values.size:
+        return np.zeros(len(values))
+    return np.where(is_number.any(axis=1), is_number.argmax(axis=1), values.shape[1])
 
 
 def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:
@@ -173,15 +175,15 @@ def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) 
 
 def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:
     """Errors in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
-    known = np.zeros(pose.shape[:2], bool)
+    has_truth = np.zeros(pose.shape[:2], bool)
     for batch in results.batches("truth", list(COLUMNS["truth"])):
-        rows = (batch["step"] > 0) & np.isin(batch["run"], runs)
-        row, column = np.searchsorted(runs, batch["run"][rows]), batch["step"][rows] - 1
-        t[column] = np.where(np.isnan(t[column]), batch["t"][rows], t[column])
-        true = np.stack([batch[axis][rows] for axis in POSE], axis=-1)
-        pose[row, column] = planar_error(true, pose[row, column], convention)
-        known[row, column] = True
-    pose[~known] = np.nan
+        after_start = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][after_start]), batch["step"][after_start] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][after_start], t[column])
+        true_pose = np.stack([batch[axis][after_start] for axis in POSE], axis=-1)
+        pose[row, column] = planar_error(true_pose, pose[row, column], convention)
+        has_truth[row, column] = True
+    pose[~has_truth] = np.nan
     return pose
 
 
@@ -263,11 +265,11 @@ def _places(results: Tables, labels: Indices) -> Array:
     """True positions (M, 3) of landmarks (M,), m; NaN where they are not known."""
     places = np.full((len(labels), 3), np.nan)
     if results.landmarks is not None and len(results.landmarks):
-        table = results.landmarks.sort_values("landmark")
-        known = table["landmark"].to_numpy()
-        at = np.minimum(np.searchsorted(known, labels), len(known) - 1)
-        here = known[at] == labels
-        places[here] = table[list("xyz")].to_numpy()[at[here]]
+        landmark_table = results.landmarks.sort_values("landmark")
+        known_landmarks = landmark_table["landmark"].to_numpy()
+        nearest = np.minimum(np.searchsorted(known_landmarks, labels), len(known_landmarks) - 1)
+        is_known = known_landmarks[nearest] == labels
+        places[is_known] = landmark_table[list("xyz")].to_numpy()[nearest[is_known]]
     return places
 
 
@@ -298,13 +300,20 @@ def results_source(results: Tables | str | Path) -> Source:
         The folder is damaged; the records raise as :func:`record_of`.
     """
     tables = results if isinstance(results, Tables) else open_results(results)
-    m, steps = tables.manifest, cache(partial(longest_run, tables))
-    unfinished = "" if m.get("complete", True) else f"only {m['finished_runs']} of {m['runs']} runs are there"
+    manifest, steps = tables.manifest, cache(partial(longest_run, tables))
+    unfinished = ""
+    if not manifest.get("complete", True):
+        unfinished = f"only {manifest['finished_runs']} of {manifest['runs']} runs are there"
+    world = manifest.get("scenario_hash") or manifest.get("log_sha256")
     return Source(
-        tables.filters, lambda name: record_of(tables, name, steps()), partial(design_of, tables), tables.has_truth,
-        (m.get("scenario") or {}).get("name"), (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed")),
-        unfinished,
-    )  # fmt: skip
+        tables.filters,
+        lambda name: record_of(tables, name, steps()),
+        partial(design_of, tables),
+        tables.has_truth,
+        scenario=(manifest.get("scenario") or {}).get("name"),
+        trials=(world, manifest.get("seed")),
+        unfinished=unfinished,
+    )
 
 
 def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> NisLog:

@@ -95,19 +95,19 @@ def _place(
     for source in sources:
         _require_same(study, source)
         machines += [machine for machine in source.get("machines", []) if machine not in machines]
-    here = this_machine()
-    if others := [machine for machine in machines if machine != here]:
+    this = this_machine()
+    if others := [machine for machine in machines if machine != this]:
         say(
-            f"consistency: {in_words(others)} computed the runs that are there, this is {in_words([here])}: "
+            f"consistency: {in_words(others)} computed the runs that are there, this is {in_words([this])}: "
             "the last digits of the others may differ from those of one machine"
         )
     kept = frozenset() if previous is None else frozenset(previous.finished_runs(study["filters"]))
-    return ResultsPlace(new, journal, previous, kept, [*others, here])
+    return ResultsPlace(new, journal, previous, kept, [*others, this])
 
 
 def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:
     """Refuse to continue from runs of something else; a study with a fixed number of runs has no plan to differ."""
-    for key, text in KEYS.items() if before else ():
-        now, then = study.get(key), before.get(key, {} if key == "error" else None)
-        if now != then and not (key == PLAN and None in (now, then)):
-            raise InputError(f"the results to resume have another {text}; use the same command as before")
+    for key, what_differs in KEYS.items() if before else ():
+        value_now, value_before = study.get(key), before.get(key, {} if key == "error" else None)
+        if value_now != value_before and not (key == PLAN and None in (value_now, value_before)):
+            raise InputError(f"the results to resume have another {what_differs}; use the same command as before")

@@ -96,8 +96,8 @@ class Campaign:
     def _results(self, runs: Sequence[int], started: float) -> Results | StoredResults:
         """The results of what is there, of which ``runs`` were asked for."""
         finished = self.gathered.finished
-        beyond = finished.difference(runs)
-        total = max(beyond) + 1 if beyond else len(runs)
+        runs_beyond = finished.difference(runs)
+        total = max(runs_beyond) + 1 if runs_beyond else len(runs)
         fields = self._fields | {"machines": self.gathered.machines(self.place.machines[:-1])}
         is_complete = len(finished) == total
         if not is_complete:

@@ -40,11 +40,11 @@ def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> RunOutcome:
 
     A run whose pose, covariance, NEES or NIS is beyond :data:`LARGEST_NUMBER` has failed in that step.
     """
-    rows = [_rows(trial, e) for e in estimates]
-    estimates = [e for e, _ in rows]
+    estimates_and_rows = [_rows(trial, e) for e in estimates]
+    estimates = [e for e, _ in estimates_and_rows]
     return RunOutcome(
         trial.run,
-        {e.filter: columns for e, columns in rows},
+        {e.filter: columns for e, columns in estimates_and_rows},
         None if trial.truth is None else truth_columns(trial, trial.truth),
         tuple(e.failure for e in estimates if e.failure),
         {e.filter: _map_columns(trial, e, e.map) for e in estimates if e.map is not None and e.failure is None},
@@ -56,8 +56,8 @@ def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
     """Counts over the observations up to the end of the run, or to the step before its failure."""
     rows = slice(trial.first[_last(trial, estimates)])
     spurious, rejected = trial.spurious[rows], rejected[rows]
-    counts = (len(rejected), spurious.sum(), rejected.sum(), (rejected & spurious).sum())
-    return Rejected(estimates.filter, trial.run, *(int(count) for count in counts))
+    observation_counts = (len(rejected), spurious.sum(), rejected.sum(), (rejected & spurious).sum())
+    return Rejected(estimates.filter, trial.run, *(int(count) for count in observation_counts))
 
 
 def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
@@ -66,8 +66,8 @@ def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
     first = _full_rank((estimates.covariance if own is None else own)[:last])
     columns = _columns(trial, estimates, last, first)
     step, reason = _first_failure(columns, first, trial.truth is not None)
-    numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
-    if not step and not all((np.abs(values) <= LARGEST_NUMBER).all() for values in numbers):
+    map_numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
+    if not step and not all((np.abs(values) <= LARGEST_NUMBER).all() for values in map_numbers):
         step, reason = last, f"a number in the map is beyond {LARGEST_NUMBER:g}"
     if not step:
         return estimates, columns
@@ -77,20 +77,20 @@ def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
 
 def _first_failure(columns: Columns, first: int, has_truth: bool) -> tuple[int, str]:
     """First step with a number that is too large, and which; 0 without one. A NEES counts after step ``first``."""
-    judged = columns["step"] > first if has_truth else np.zeros(len(columns["step"]), bool)
-    everywhere = np.ones(len(judged), bool)
-    numbers = {
-        "NEES": (("nees", "own_nees"), judged), "NIS": (("nis",), columns["nis_dof"] > 0),
-        "pose": (POSE, everywhere), "covariance": ((*COVARIANCE, *OWN_COVARIANCE), everywhere),
+    has_nees = columns["step"] > first if has_truth else np.zeros(len(columns["step"]), bool)
+    every_step = np.ones(len(has_nees), bool)
+    limited = {
+        "NEES": (("nees", "own_nees"), has_nees), "NIS": (("nis",), columns["nis_dof"] > 0),
+        "pose": (POSE, every_step), "covariance": ((*COVARIANCE, *OWN_COVARIANCE), every_step),
     }  # fmt: skip
     faults = []
-    for kind, (names, counted) in numbers.items():
-        size = np.max([np.abs(columns[name]) for name in names if name in columns], axis=0)  # NaN of any NaN
-        bad = counted & ~(size <= LARGEST_NUMBER)
-        if bad.any():
-            at = int(bad.argmax())
-            beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(size[at]) else "is not finite"
-            faults.append((at + 1, f"the {kind} {beyond}"))
+    for kind, (names, steps) in limited.items():
+        largest = np.max([np.abs(columns[name]) for name in names if name in columns], axis=0)  # NaN of any NaN
+        too_large = steps & ~(largest <= LARGEST_NUMBER)
+        if too_large.any():
+            step = int(too_large.argmax())
+            beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(largest[step]) else "is not finite"
+            faults.append((step + 1, f"the {kind} {beyond}"))
     return min(faults, key=lambda fault: fault[0], default=(0, ""))
 
 
@@ -130,13 +130,13 @@ def _full_rank(P: Array) -> int:
 
 def _nees(error: Array | None, P: Array, first: int) -> Array:
     """NEES of one run, (T, 3) and (T, 3, 3) -> (T,); NaN before step ``first``."""
-    value = np.full(len(P), np.nan)
+    nees = np.full(len(P), np.nan)
     if error is not None:
         # the filter has answered for P: what nees() checks need not be checked again
         with np.errstate(over="ignore"):
-            w = whiten(error[first:], P[first:])
-            value[first:] = np.einsum("ki,ki->k", w, w)
-    return value
+            whitened = whiten(error[first:], P[first:])
+            nees[first:] = np.einsum("ki,ki->k", whitened, whitened)
+    return nees
 
 
 def is_flat(covariance: Array) -> bool:
@@ -146,19 +146,19 @@ def is_flat(covariance: Array) -> bool:
 
 def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
     """Rows of ``map.parquet``; without NEES where the id is not a landmark of the world, or its place is not known."""
-    ids, count = map_.landmarks, len(map_.landmarks)
+    landmark_ids, count = map_.landmarks, len(map_.landmarks)
     nees, joint = np.full(count, np.nan), np.full(count, np.nan)
     if trial.landmarks is not None:
-        judged = (ids < len(trial.landmarks)) & ~np.isin(ids, trial.things)
-        n = 2 if is_flat(map_.covariance) else 3
-        error = trial.landmarks[ids[judged]] - map_.mean[judged]
-        w = whiten(error[:, :n], map_.covariance[judged, :n, :n])
+        judged = (landmark_ids < len(trial.landmarks)) & ~np.isin(landmark_ids, trial.things)
+        dof = 2 if is_flat(map_.covariance) else 3
+        landmark_error = trial.landmarks[landmark_ids[judged]] - map_.mean[judged]
+        whitened_landmarks = whiten(landmark_error[:, :dof], map_.covariance[judged, :dof, :dof])
         with np.errstate(over="ignore"):
-            nees[judged] = _capped(np.einsum("ki,ki->k", w, w))
+            nees[judged] = _capped(np.einsum("ki,ki->k", whitened_landmarks, whitened_landmarks))
         joint[judged] = _joint_nees(trial, estimates, map_, judged)
     return {
         "run": np.full(count, trial.run),
-        "landmark": ids if trial.labels is None else trial.labels[ids],
+        "landmark": landmark_ids if trial.labels is None else trial.labels[landmark_ids],
         **dict(zip("xyz", map_.mean.T, strict=True)),
         **{name: map_.covariance[:, i, j] for name, (i, j) in POINT_COVARIANCE.items()},
         "nees": nees,
@@ -179,15 +179,15 @@ def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) ->
     """
     if map_.joint is None or trial.truth is None or trial.landmarks is None:
         return np.full(int(judged.sum()), np.nan)
-    ids, P = map_.landmarks[judged], map_.joint
+    landmark_ids, P = map_.landmarks[judged], map_.joint
     if not judged.all():
-        kept = np.repeat(np.append(True, judged), 3)
-        P = P[np.ix_(kept, kept)]
+        kept_rows = np.repeat(np.append(True, judged), 3)
+        P = P[np.ix_(kept_rows, kept_rows)]
     with one_blas_thread():
         error, P = planar_map_error(
-            trial.truth[-1], trial.landmarks[ids], estimates.pose[-1], map_.mean[judged], P, estimates.error
+            trial.truth[-1], trial.landmarks[landmark_ids], estimates.pose[-1], map_.mean[judged], P, estimates.error
         )
         if is_flat(map_.covariance):
-            flat = np.flatnonzero(np.append([1, 1, 1], np.tile([1, 1, 0], len(ids))))
+            flat = np.flatnonzero(np.append([1, 1, 1], np.tile([1, 1, 0], len(landmark_ids))))
             return joint_nees(error[flat], P[np.ix_(flat, flat)], dof=2)[1:]
         return joint_nees(error, P)[1:]

@@ -38,9 +38,9 @@ def nis_ratio(of: Record, runs: int) -> Array:
 
 
 def _ratio(nis: Array, nis_dof: Array) -> Array:
-    known = np.isfinite(nis) & (nis_dof > 0)
-    dof = np.where(known, nis_dof, 0).sum(axis=0)
-    total = np.where(known, nis, 0.0).sum(axis=0)
+    has_nis = np.isfinite(nis) & (nis_dof > 0)
+    dof = np.where(has_nis, nis_dof, 0).sum(axis=0)
+    total = np.where(has_nis, nis, 0.0).sum(axis=0)
     return np.asarray(np.where(dof > 0, total / np.maximum(dof, 1), np.nan))
 
 

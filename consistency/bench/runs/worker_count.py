@@ -31,12 +31,12 @@ def worker_count(jobs: int) -> int:
 
 def memory_here() -> int:
     """Return the bytes of memory of this machine or its container; 2**60 where neither is known."""
-    limits = [2**60]
+    memory_limits = [2**60]
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        memory_limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     with suppress(OSError, ValueError):
-        limits.append(int(CONTAINER_LIMIT.read_text(encoding="ascii")))
-    return min(limits)
+        memory_limits.append(int(CONTAINER_LIMIT.read_text(encoding="ascii")))
+    return min(memory_limits)
 
 
 def workers_that_fit(trials: Sequence[Trial], workers: int) -> int:
@@ -48,17 +48,17 @@ def workers_that_fit(trials: Sequence[Trial], workers: int) -> int:
         A single covariance of the state exceeds the memory.
     """
     landmarks = max(len(set(trial.landmark.tolist())) for trial in trials)
-    covariance, here = 8 * (POSE + LANDMARK * landmarks) ** 2, memory_here()
-    if covariance > here:
+    covariance_memory, machine_memory = 8 * (POSE + LANDMARK * landmarks) ** 2, memory_here()
+    if covariance_memory > machine_memory:
         raise InputError(
-            f"a covariance of {landmarks} landmarks takes {covariance / GIB:.1f} GiB, and there are "
-            f"{here / GIB:.1f} GiB; take fewer landmarks, or a machine with more memory"
+            f"a covariance of {landmarks} landmarks takes {covariance_memory / GIB:.1f} GiB, and there are "
+            f"{machine_memory / GIB:.1f} GiB; take fewer landmarks, or a machine with more memory"
         )
-    run = COPIES * covariance
-    fitting = max(1, min(workers, here // run))
-    if run > WORTH_SAYING * here:
+    run_memory = COPIES * covariance_memory
+    fitting = max(1, min(workers, machine_memory // run_memory))
+    if run_memory > WORTH_SAYING * machine_memory:
         say(
-            f"consistency: a run of {landmarks} landmarks takes about {run / GIB:.1f} of {here / GIB:.1f} GiB; "
-            f"{fitting} of {workers} workers have room"
+            f"consistency: a run of {landmarks} landmarks takes about {run_memory / GIB:.1f} of "
+            f"{machine_memory / GIB:.1f} GiB; {fitting} of {workers} workers have room"
         )
     return fitting

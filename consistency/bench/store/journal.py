@@ -167,10 +167,10 @@ def _decode(numbers: bytes, types: Mapping[str, str]) -> Columns:
     """Return the columns of a part, all of one length."""
     rows = len(numbers) // sum(np.dtype(kind).itemsize for kind in types.values())
     columns: dict[str, Array] = {}
-    at = 0
+    offset = 0
     for name, kind in types.items():
-        columns[name] = np.frombuffer(numbers, kind, rows, at)
-        at += columns[name].nbytes
+        columns[name] = np.frombuffer(numbers, kind, rows, offset)
+        offset += columns[name].nbytes
     return columns
 
 

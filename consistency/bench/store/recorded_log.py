@@ -55,10 +55,10 @@ def table_file(folder: Path, name: str) -> Path:
         Both are there.
     """
     paths = [folder / f"{name}.{form}" for form in FORMATS]
-    there = [path for path in paths if path.exists()]
-    if len(there) > 1:
-        raise InputError(f"{folder}: holds {there[0].name} and {there[1].name}; take one of them away")
-    return there[0] if there else paths[0]
+    existing = [path for path in paths if path.exists()]
+    if len(existing) > 1:
+        raise InputError(f"{folder}: holds {existing[0].name} and {existing[1].name}; take one of them away")
+    return existing[0] if existing else paths[0]
 
 
 def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.DataFrame:
@@ -263,11 +263,11 @@ def _check(folder: Path, controls: pd.DataFrame, observations: pd.DataFrame, bel
     path = table_file(folder, "observations")
     if observations.empty:
         raise InputError(f"{path}: holds no observation; no landmark was ever in view")
-    twice = observations.duplicated(["run", "step", "landmark"])
-    _refuse(path, twice, "row {}: this landmark is duplicated in one step")
-    known = pd.MultiIndex.from_frame(controls[["run", "step"]])
-    stray = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(known)
-    _refuse(path, stray, f"row {{}}: {table_file(folder, 'controls').name} has no such run and step")
+    repeated = observations.duplicated(["run", "step", "landmark"])
+    _refuse(path, repeated, "row {}: this landmark is duplicated in one step")
+    control_steps = pd.MultiIndex.from_frame(controls[["run", "step"]])
+    without_control = ~pd.MultiIndex.from_frame(observations[["run", "step"]]).isin(control_steps)
+    _refuse(path, without_control, f"row {{}}: {table_file(folder, 'controls').name} has no such run and step")
     if belief.sensor.model == "uvd":
         _refuse(path, observations["z2"] <= 0, "column 'z2', row {}: a disparity must be positive")
 
@@ -282,14 +282,15 @@ def _check_pixels(folder: Path, observations: pd.DataFrame, sensor: SensorFile) 
     """Pixels must be relative to the principal point: with it they must fall into the image."""
     if sensor.model != "uvd" or sensor.image is None:
         return
-    for column, middle, size, sigma in zip(("z0", "z1"), sensor.centre, sensor.image, sensor.sigma, strict=False):
-        pixel = observations[column].to_numpy() + middle
-        outside = (pixel < -6 * sigma) | (pixel > size + 6 * sigma)
+    sides = zip(("z0", "z1"), sensor.centre, sensor.image, sensor.sigma, strict=False)
+    for column, principal, image_size, sigma in sides:
+        pixel = observations[column].to_numpy() + principal
+        outside = (pixel < -6 * sigma) | (pixel > image_size + 6 * sigma)
         if outside.mean() > STRAY:
             row = int(np.flatnonzero(outside)[0])
-            value = observations[column].iloc[row]
+            pixel_value = observations[column].iloc[row]
             raise InputError(
-                f"{table_file(folder, 'observations')}: column '{column}', row {row}: {value:.1f} px "
+                f"{table_file(folder, 'observations')}: column '{column}', row {row}: {pixel_value:.1f} px "
                 "is outside the image of sensor.toml; u and v must be relative to the principal point"
             )
 
@@ -310,14 +311,17 @@ def _names(folder: Path, observations: pd.DataFrame, landmarks: pd.DataFrame | N
     labels = np.unique(observations["landmark"])
     if "source" not in observations:
         return _Names(labels, labels[:0])
-    wrong = (observations["source"] < -1) | (observations["landmark"] < 0)
+    wrong_numbers = (observations["source"] < -1) | (observations["landmark"] < 0)
     _refuse(
-        table_file(folder, "observations"), wrong,
+        table_file(folder, "observations"), wrong_numbers,
         "row {}: beside a column 'source' landmarks are numbered from 0, and a source is one of them or -1",
     )  # fmt: skip
-    source = np.unique(observations["source"])
-    known = source[source >= 0] if landmarks is None else np.concatenate([source[source >= 0], landmarks["landmark"]])
-    real = np.union1d(source[source >= 0], np.intersect1d(labels, known))
+    sources = np.unique(observations["source"])
+    sources = sources[sources >= 0]
+    known_landmarks = sources
+    if landmarks is not None:
+        known_landmarks = np.concatenate([sources, landmarks["landmark"]])
+    real = np.union1d(sources, np.intersect1d(labels, known_landmarks))
     return _Names(real, np.setdiff1d(labels, real))
 
 
@@ -332,12 +336,12 @@ def _positions(folder: Path, landmarks: pd.DataFrame | None, names: _Names, beli
         if belief.sensor.model == "linear":
             raise InputError(f"{path}: missing; a linear world needs the landmarks it is linearised about")
         return None
-    table = landmarks.set_index("landmark")[["x", "y", "z"]]
-    if table.index.has_duplicates:
+    known_positions = landmarks.set_index("landmark")[["x", "y", "z"]]
+    if known_positions.index.has_duplicates:
         raise InputError(f"{path}: column 'landmark': every landmark may be listed once")
-    if missing := sorted(set(labels) - set(table.index)):
+    if missing := sorted(set(labels) - set(known_positions.index)):
         raise InputError(f"{path}: landmark {missing[0]} of observations.parquet is not there")
-    return table.loc[list(labels)].to_numpy(float)
+    return known_positions.loc[list(labels)].to_numpy(float)
 
 
 def _by_run(table: pd.DataFrame) -> Callable[[int], pd.DataFrame]:
@@ -357,13 +361,13 @@ def _trial(
     positions: Array | None,
 ) -> Trial:
     """A trial of its rows of the tables, in order of the steps."""
-    steps, path = len(controls), None
+    steps, true_path = len(controls), None
     if truth is not None:
         if not np.array_equal(truth["step"], np.arange(steps + 1)):
             raise InputError(f"{table_file(folder, 'truth')}: run {run} must have the steps 0 to {steps}, each once")
-        path = truth[POSE].to_numpy(float)
+        true_path = truth[POSE].to_numpy(float)
     if start is None:
-        start = path[0] if path is not None else np.zeros(3)
+        start = np.zeros(3) if true_path is None else true_path[0]
     return Trial(
         run,
         start,
@@ -372,7 +376,7 @@ def _trial(
         names.ids(rows["landmark"]),
         rows[[name for name in ("z0", "z1", "z2") if name in rows]].to_numpy(float),
         len(names.landmarks) + len(names.things),
-        path,
+        true_path,
         positions,
         names.ids(rows["source"]) if "source" in rows else None,
         np.concatenate(names).astype(np.int64),

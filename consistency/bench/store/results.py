@@ -111,9 +111,9 @@ class Tables(ABC):
 
     def runs_of(self, filter_name: str) -> Indices:
         """Numbers of the runs of one filter, failed ones too, sorted."""
-        parts = [np.unique(batch["run"]) for batch in self.batches("estimates", ["run"], filter_name)]
-        parts.append(self.failures.loc[self.failures["filter"] == filter_name, "run"].to_numpy())
-        return np.unique(np.concatenate(parts)).astype(np.int64)
+        run_numbers = [np.unique(batch["run"]) for batch in self.batches("estimates", ["run"], filter_name)]
+        run_numbers.append(self.failures.loc[self.failures["filter"] == filter_name, "run"].to_numpy())
+        return np.unique(np.concatenate(run_numbers)).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,9 @@ def joined(parts: Sequence[Results]) -> Results:
     manifest |= {"error": errors} if errors else {}
     tables: dict[str, Any] = {}
     for name in ("estimates", "failures", "map", "rejections"):
-        all_ = (getattr(part, name) for part in parts)
-        those = [table for table in all_ if table is not None and (name != "failures" or len(table))]
-        tables[name] = pd.concat(those, ignore_index=True) if those else getattr(parts[0], name)
+        tables_of_parts = (getattr(part, name) for part in parts)
+        tables_there = [table for table in tables_of_parts if table is not None and (name != "failures" or len(table))]
+        tables[name] = pd.concat(tables_there, ignore_index=True) if tables_there else getattr(parts[0], name)
     return replace(parts[0], manifest=manifest, **tables)
 
 

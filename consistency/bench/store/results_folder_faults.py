@@ -142,14 +142,14 @@ def _steps(folder: Path, table: str, begin: int, filter_name: str | None = None)
     run, step = -1, 0
     for batch in read_batches(folder, table, ["run", "step"], filter_name):
         runs, steps = batch["run"].astype(np.int64), batch["step"].astype(np.int64)
-        before, last = np.append(run, runs[:-1]), np.append(step, steps[:-1])
-        right = np.where(runs == before, steps == last + 1, (steps == begin) & (runs > before))
-        if not right.all():
-            row = int(np.argmin(right))
-            of = "" if filter_name is None else f" of '{filter_name}'"
+        runs_before, steps_before = np.append(run, runs[:-1]), np.append(step, steps[:-1])
+        is_next = np.where(runs == runs_before, steps == steps_before + 1, (steps == begin) & (runs > runs_before))
+        if not is_next.all():
+            row = int(np.argmin(is_next))
+            of_filter = "" if filter_name is None else f" of '{filter_name}'"
             raise InputError(
-                f"{folder / table}.parquet: step {steps[row]} of run {runs[row]}{of} is not what comes next; runs and "
-                f"steps stand in order, each once; {AGAIN}"
+                f"{folder / table}.parquet: step {steps[row]} of run {runs[row]}{of_filter} is not what comes "
+                f"next; runs and steps stand in order, each once; {AGAIN}"
             )
         for number, rows in zip(*np.unique(runs, return_counts=True), strict=True):
             counts[int(number)] = counts.get(int(number), 0) + int(rows)
@@ -158,9 +158,10 @@ def _steps(folder: Path, table: str, begin: int, filter_name: str | None = None)
 
 
 def _require_all_rows(folder: Path, table: str, rows: int) -> None:
-    there = require_table(folder, table).metadata.num_rows
-    if there != rows:
-        raise InputError(f"{folder / table}.parquet: {there - rows} of {there} rows are of no filter; {AGAIN}")
+    rows_there = require_table(folder, table).metadata.num_rows
+    if rows_there != rows:
+        strays = rows_there - rows
+        raise InputError(f"{folder / table}.parquet: {strays} of {rows_there} rows are of no filter; {AGAIN}")
 
 
 def _lengths(folder: Path, scenario: Scenario | None, truth: Steps | None, there: dict[str, Steps]) -> Steps:
@@ -199,17 +200,17 @@ def _require_filter(path: Path, name: str, there: Steps, failed: Steps, length: 
 
 
 def _require_maps(folder: Path, there: dict[str, Steps], failed: dict[str, Steps]) -> None:
-    path, rows = folder / "map.parquet", 0
+    path, rows_of_filters = folder / "map.parquet", 0
     for name in there:
         parts = [pd.DataFrame(batch) for batch in read_batches(folder, "map", ["run", "landmark"], name)]
         table = pd.concat(parts) if parts else pd.DataFrame({"run": [], "landmark": []})
-        rows += len(table)
+        rows_of_filters += len(table)
         if table.duplicated().any():
             run, landmark = table[table.duplicated()].iloc[0]
             raise InputError(f"{path}: landmark {landmark:.0f} of run {run:.0f} of '{name}' is duplicated; {AGAIN}")
-        if strange := sorted(set(table["run"]) - (set(there[name]) - set(failed[name]))):
-            raise InputError(f"{path}: '{name}' has no finished run {strange[0]:.0f}; {AGAIN}")
-    _require_all_rows(folder, "map", rows)
+        if runs_without_map := sorted(set(table["run"]) - (set(there[name]) - set(failed[name]))):
+            raise InputError(f"{path}: '{name}' has no finished run {runs_without_map[0]:.0f}; {AGAIN}")
+    _require_all_rows(folder, "map", rows_of_filters)
 
 
 def _require_rejections(path: Path, table: pd.DataFrame, there: dict[str, Steps], failed: dict[str, Steps]) -> None:
@@ -219,9 +220,13 @@ def _require_rejections(path: Path, table: pd.DataFrame, there: dict[str, Steps]
         runs = {*there.get(str(name), ()), *failed.get(str(name), ())}
         if rows["run"].duplicated().any() or set(rows["run"]) != runs:
             raise InputError(f"{path}: must have each run of '{one_line(name)}' once; {AGAIN}")
-    few, many = table[["spurious", "rejected", "rejected_spurious"]], table["offered"]
-    both = table["spurious"] + table["rejected"] - table["rejected_spurious"]
-    if (few < 0).any(axis=None) or (both > many).any() or (few.iloc[:, 2] > few.iloc[:, :2].min(axis=1)).any():
+    rejected_counts, offered = table[["spurious", "rejected", "rejected_spurious"]], table["offered"]
+    rejected_or_spurious = table["spurious"] + table["rejected"] - table["rejected_spurious"]
+    if (
+        (rejected_counts < 0).any(axis=None)
+        or (rejected_or_spurious > offered).any()
+        or (rejected_counts.iloc[:, 2] > rejected_counts.iloc[:, :2].min(axis=1)).any()
+    ):
         raise InputError(f"{path}: counts of rejected observations do not go together; {AGAIN}")
 
 

@@ -60,8 +60,8 @@ class Regime:
         return pd.DataFrame(rows, columns=[*(axis.key for axis in axes), "filter", *FIELDS])
 
 
-def _table_value(value: Any) -> Any:
-    return value if isinstance(value, int | float | str) else json.dumps(value)
+def _table_value(axis_value: Any) -> Any:
+    return axis_value if isinstance(axis_value, int | float | str) else json.dumps(axis_value)
 
 
 def ranked_by_cost(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:

@@ -62,8 +62,8 @@ def _cells_table(regime: Regime) -> Table:
     columns += map(Column, sweep.filters)
     rows: list[tuple[Cell, ...]] = []
     for cell in sweep.cells:
-        found = regime.at(cell)
-        verdicts = [_verdict(found.get(name)) for name in sweep.filters]
+        results_of_cell = regime.at(cell)
+        verdicts = [_verdict(results_of_cell.get(name)) for name in sweep.filters]
         rows.append((*values_of(sweep, axes, cell), *verdicts))
     return table(tuple(columns), rows, "Cells")
 

@@ -43,13 +43,17 @@ def run_sweep(sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, 
     folder.begin()
     work = folder.all_work()
     # unfinished work is of a process at work, or of one that was killed as it ended
-    todo = [each for each in work if folder.result(each) is None or unfinished_of(folder.place(each)).exists()]
+    todo = [
+        cell_work
+        for cell_work in work
+        if folder.result(cell_work) is None or unfinished_of(folder.place(cell_work)).exists()
+    ]
     if len(todo) < len(work):
         say(f"{len(work) - len(todo)} of {len(work)} are there already")
     started = time.monotonic()
     for count, done in enumerate(_in_turn(folder, todo, {"jobs": jobs, **how}), 1):
-        left = (time.monotonic() - started) / count * (len(todo) - count)
-        say(f"{count} of {len(todo)}: {done.text}: {_outcome_text(folder.result(done))}{_time_left(left)}")
+        seconds_left = (time.monotonic() - started) / count * (len(todo) - count)
+        say(f"{count} of {len(todo)}: {done.text}: {_outcome_text(folder.result(done))}{_time_left(seconds_left)}")
     return folder
 
 

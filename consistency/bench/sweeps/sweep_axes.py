@@ -126,9 +126,12 @@ class Axis:
 
     def say(self, index: int) -> str:
         """One value with its unit, as "0.09 m" or "×0.5"."""
-        value = self.values[index]
-        text = f"{value:.3g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
-        return f"×{text}" if self.unit == "×" else f"{text} {self.unit}".rstrip()
+        value_text = value = self.values[index]
+        if isinstance(value, float):
+            value_text = f"{value:.3g}"
+        elif not isinstance(value, str):
+            value_text = json.dumps(value)
+        return f"×{value_text}" if self.unit == "×" else f"{value_text} {self.unit}".rstrip()
 
     def changes(self, base: Scenario, value: Any) -> Changes:
         """Keys of the scenario that a value sets.
@@ -165,11 +168,11 @@ def require_key(axis: Axis, base: Scenario) -> None:
         table: Any = base.model_dump()
         for part in key.split("."):
             stem = part.rpartition("_")[0]  # a key may end in its unit
-            known = sorted(table) if isinstance(table, Mapping) else []
-            if part not in known and stem not in known:
+            scenario_keys = sorted(table) if isinstance(table, Mapping) else []
+            if part not in scenario_keys and stem not in scenario_keys:
                 allowed = f"{', '.join(QUANTITIES)}, or a key of the scenario"
-                if known and part != key.split(".")[0]:
-                    allowed += f", where '{part}' could be {', '.join(known)}"
+                if scenario_keys and part != key.split(".")[0]:
+                    allowed += f", where '{part}' could be {', '.join(scenario_keys)}"
                 raise InputError(f"key '{axis.table}.{axis.key}': unknown; allowed: {allowed}")
             table = table.get(part, table.get(stem))
 

@@ -116,22 +116,22 @@ class Sweep:
 def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
     """Places on all axes: those of the grid, the last axis fastest, each with the values of one more axis alone."""
     choices = [range(len(axis.values)) if axis.home is None else (axis.home,) for axis in axes]
-    for at in itertools.product(*choices):
-        yield at
+    for grid_point in itertools.product(*choices):
+        yield grid_point
         for k, axis in enumerate(axes):
             for i in range(len(axis.values)):
                 if axis.home not in (None, i):
-                    yield (*at[:k], i, *at[k + 1 :])
+                    yield (*grid_point[:k], i, *grid_point[k + 1 :])
 
 
 def number_of_points(axes: Sequence[Axis]) -> int:
-    in_grid, alone = 1, 0
+    grid_points, values_alone = 1, 0
     for axis in axes:
         if axis.home is None:
-            in_grid *= len(axis.values)
+            grid_points *= len(axis.values)
         else:
-            alone += len(axis.values) - 1
-    return in_grid * (1 + alone)
+            values_alone += len(axis.values) - 1
+    return grid_points * (1 + values_alone)
 
 
 def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
@@ -152,12 +152,12 @@ def text_of(axes: Sequence[Axis], at: Sequence[int]) -> str:
 
 
 def _folder_name(axes: Sequence[Axis], at: Sequence[int]) -> str:
-    parts = []
+    folder_parts = []
     for axis, i in _changed(axes, at):
         value = axis.values[i]
-        text = f"{value:.12g}" if isinstance(value, float) else str(value)
-        parts.append(f"{axis.key}-{re.sub(r'[^A-Za-z0-9.+-]+', '_', text).strip('_')}")
-    name = "_".join(parts) or "base"
+        value_text = f"{value:.12g}" if isinstance(value, float) else str(value)
+        folder_parts.append(f"{axis.key}-{re.sub(r'[^A-Za-z0-9.+-]+', '_', value_text).strip('_')}")
+    name = "_".join(folder_parts) or "base"
     return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
@@ -247,27 +247,26 @@ def alone(axis: Axis, base: Scenario) -> Axis:
     InputError
         The base has no such value.
     """
-    own = axis.own(base)
-    if own is None or own != own:
+    base_value = axis.own(base)
+    if base_value is None or base_value != base_value:
         raise InputError(f"key 'alone.{axis.key}': {base.name} has no value there to start from; use 'grid'")
-    values = axis.values if own in axis.values else (own, *axis.values)
+    values = axis.values if base_value in axis.values else (base_value, *axis.values)
     if all(map(is_number, values)):
         values = tuple(sorted(values))
-    return Axis(axis.key, values, values.index(own))
+    return Axis(axis.key, values, values.index(base_value))
 
 
 def _require_cells(sweep: Sweep) -> None:
     """Check every value alone, so that the message names its key; then every cell, and a folder's name for each."""
-    taken: dict[str, str] = {}
+    axis_by_key: dict[str, str] = {}
     for axis in sweep.axes:
         keys = _keys_of(axis, sweep.base)
         for key in keys:
-            if key in taken:
-                raise InputError(
-                    f"keys 'grid.{taken[key]}' and '{axis.table}.{axis.key}' both set {key}; leave one of them out"
-                )
+            if key in axis_by_key:
+                both = f"'grid.{axis_by_key[key]}' and '{axis.table}.{axis.key}'"
+                raise InputError(f"keys {both} both set {key}; leave one of them out")
         if axis.home is None:  # axes that vary alone never meet
-            taken |= dict.fromkeys(keys, axis.key)
+            axis_by_key |= dict.fromkeys(keys, axis.key)
     count = number_of_points(sweep.axes)
     if count > MOST_CELLS:
         raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
@@ -275,8 +274,8 @@ def _require_cells(sweep: Sweep) -> None:
         names = Counter(cell.name for cell in sweep.cells)
     except ValueError as error:
         raise InputError(f"key 'grid': some values do not go together: {explain(error, Scenario)}") from None
-    name, times = names.most_common(1)[0]
-    if times > 1:
+    name, cells_of_name = names.most_common(1)[0]
+    if cells_of_name > 1:
         raise InputError(f"key 'grid': two values are too much alike to be told apart ({name})")
 
 

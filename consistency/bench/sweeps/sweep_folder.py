@@ -95,14 +95,14 @@ class SweepFolder:
 
     def changed_input(self, work: CellWork) -> str:
         """What the result that is there was made with and what differs now, in words; empty where all is the same."""
-        path = self.place(work)
-        before = read_manifest(path).get("inputs")
-        if not isinstance(before, dict):
-            raise InputError(f"{path}/manifest.json: key 'inputs' is missing; remove that folder")
+        cell_folder = self.place(work)
+        inputs_before = read_manifest(cell_folder).get("inputs")
+        if not isinstance(inputs_before, dict):
+            raise InputError(f"{cell_folder}/manifest.json: key 'inputs' is missing; remove that folder")
         for key, value in self.inputs(work).items():
-            if before.get(key) != value:
-                what = "source code of the bench" if key == "code" else key
-                return f"{path}: made with another {what} ({before.get(key)}, now {value})"
+            if inputs_before.get(key) != value:
+                input_name = "source code of the bench" if key == "code" else key
+                return f"{cell_folder}: made with another {input_name} ({inputs_before.get(key)}, now {value})"
         return ""
 
     def require_usable(self, overwrite: bool) -> None:
@@ -117,12 +117,12 @@ class SweepFolder:
             raise InputError(f"--out {self.path}: holds {kind}, not a sweep; choose another folder")
         if overwrite:
             return
-        there = [work for work in self.all_work() if self.place(work).exists()]
-        changed = [text for work in there if (text := self.changed_input(work))]
-        if changed:
-            more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        finished_cells = [work for work in self.all_work() if self.place(work).exists()]
+        changed_cells = [text for work in finished_cells if (text := self.changed_input(work))]
+        if changed_cells:
+            more = f" (and {len(changed_cells) - 1} more)" if len(changed_cells) > 1 else ""
             raise InputError(
-                f"{changed[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
+                f"{changed_cells[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
             )
 
     def all_work(self) -> list[CellWork]:
@@ -143,13 +143,13 @@ class SweepFolder:
             except InputError:
                 if not self.path.exists():
                     raise
-        before = read_manifest(self.path)
+        manifest_before = read_manifest(self.path)
         try:
-            former = sweep_from(before, self.path)
+            sweep_before = sweep_from(manifest_before, self.path)
         except InputError:
-            former = self.sweep
-        if replace(former, filters=()) == replace(self.sweep, filters=()):
-            self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*former.filters, *self.sweep.filters))))
+            sweep_before = self.sweep
+        if replace(sweep_before, filters=()) == replace(self.sweep, filters=()):
+            self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*sweep_before.filters, *self.sweep.filters))))
         text = json.dumps(manifest | {"sweep": describe(self.sweep), "tables": []}, indent=2)
         write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
 
@@ -185,13 +185,13 @@ class SweepFolder:
 
     def results(self) -> dict[tuple[int, str], CellResult]:
         """What is there, by number of the cell and filter; results with other inputs are left out."""
-        found: dict[tuple[int, str], CellResult] = {}
+        cell_results: dict[tuple[int, str], CellResult] = {}
         for cell in self.sweep.cells:
             for name in self.sweep.filters:
                 result = self.result(CellWork(cell, name))
                 if result is not None:
-                    found[cell.number, name] = result
-        return found
+                    cell_results[cell.number, name] = result
+        return cell_results
 
 
 def describe(sweep: Sweep) -> dict[str, Any]:

@@ -70,9 +70,9 @@ def score_of(trial: Trial, estimates: Estimates) -> RunScore:
                 "and S"
             )
         log_det = np.full(len(nis), np.nan)
-    known = np.isfinite(nis) & np.isfinite(log_det) & (dof > 0)
-    density = np.where(known, -0.5 * (nis + log_det + dof * np.log(2.0 * np.pi)), 0.0)
-    return RunScore(density, float(nis[known].sum()), float(dof[known].sum()), failure)
+    has_innovation = np.isfinite(nis) & np.isfinite(log_det) & (dof > 0)
+    density = np.where(has_innovation, -0.5 * (nis + log_det + dof * np.log(2.0 * np.pi)), 0.0)
+    return RunScore(density, float(nis[has_innovation].sum()), float(dof[has_innovation].sum()), failure)
 
 
 @dataclass(frozen=True)

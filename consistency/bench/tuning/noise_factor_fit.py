@@ -61,15 +61,15 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     start = next((start for start in starts if np.isfinite(scores.total(start))), None)
     if start is None:
         return None
-    size = scores(start).size
-    how: dict[str, Any] = {"method": "COBYQA", "bounds": [(-LIMIT, LIMIT)] * len(start)}
-    how["options"] = _search_options(RADII, MOST_SETTINGS)
+    densities = scores(start).size
+    search_options: dict[str, Any] = {"method": "COBYQA", "bounds": [(-LIMIT, LIMIT)] * len(start)}
+    search_options["options"] = _search_options(RADII, MOST_SETTINGS)
 
     def loss(x: Array) -> float:
-        return -scores.total(x) / size
+        return -scores.total(x) / densities
 
-    found: Any = minimize(loss, start, **how)
-    best = np.clip(found.x, -LIMIT, LIMIT)
+    search_result: Any = minimize(loss, start, **search_options)
+    best = np.clip(search_result.x, -LIMIT, LIMIT)
     edge = np.where(np.abs(best) > LIMIT - AT_LIMIT, np.sign(best), 0.0).astype(int)
     free = np.flatnonzero(edge == 0)
     slope, curvature = derivatives(scores, best, free)
@@ -97,10 +97,10 @@ class KnownScores:
         self._shape = density.shape
         return density
 
-    def total(self, x: Array) -> float:
+    def total_log_density(self, x: Array) -> float:
         """Return the total log density; minus infinity where a run failed."""
-        total = float(self(x).sum())
-        return total if np.isfinite(total) else -np.inf
+        total_log_density = float(self(x).sum())
+        return total_log_density if np.isfinite(total_log_density) else -np.inf
 
     @property
     def settings(self) -> int:
@@ -151,8 +151,8 @@ def profile_intervals(score: Callable[[Array], Array], best: Array, curvature: A
     curvature : second derivatives of the total score there (p, p); 0 where they are not known
     limit : log factors lie within it on both sides
     """
-    value, vector = np.linalg.eigh(-curvature)
-    covariance = (vector / np.maximum(value, WEAK)) @ vector.T
+    eigenvalues, eigenvectors = np.linalg.eigh(-curvature)
+    covariance = (eigenvectors / np.maximum(eigenvalues, WEAK)) @ eigenvectors.T
     half_widths = NORMAL * np.sqrt(np.diag(covariance))
     unit = np.minimum(half_widths, LARGEST_STEP)
     at_best = independent_sums(score(best))
@@ -182,22 +182,22 @@ def _search_options(radii: tuple[float, float], settings: int) -> dict[str, Any]
 
 def _farthest(i: int, side: float, depth: Callable[[Any], Any], guess: Array, low: Array, high: Array) -> float:
     """Return the largest (``side`` 1) or smallest (-1) coordinate ``i`` of the points at a depth of 1 at most."""
-    how: dict[str, Any] = {"method": "COBYQA", "bounds": list(zip(low, high, strict=True))}
-    how["constraints"] = NonlinearConstraint(depth, -np.inf, 1.0)
-    how["options"] = _search_options(END_RADII, END_SETTINGS)
+    search_options: dict[str, Any] = {"method": "COBYQA", "bounds": list(zip(low, high, strict=True))}
+    search_options["constraints"] = NonlinearConstraint(depth, -np.inf, 1.0)
+    search_options["options"] = _search_options(END_RADII, END_SETTINGS)
 
     def nearness(u: Array) -> float:
         return float(-side * u[i])
 
-    found: Any = minimize(nearness, guess, **how)
-    return float(found.x[i])
+    search_result: Any = minimize(nearness, guess, **search_options)
+    return float(search_result.x[i])
 
 
 def independent_sums(density: Array) -> Array:
     """Sum (R, T) over what is taken to be independent: runs, or blocks of steps of few runs."""
     blocks = -(-UNITS // len(density))
-    parts = [part.sum(axis=1) for part in np.array_split(density, blocks, axis=1)]
-    return np.concatenate(parts)
+    block_sums = [part.sum(axis=1) for part in np.array_split(density, blocks, axis=1)]
+    return np.concatenate(block_sums)
 
 
 def depth_of(at_best: Array, here: Array, factors: int) -> float:

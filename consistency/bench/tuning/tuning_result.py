@@ -123,20 +123,20 @@ def _factor_lines(setting: Setting, before: Belief) -> list[str]:
 def factor_text(factor: Factor) -> str:
     """x1.02 [0.97, 1.07], of variances; "at most" or "at least" where the data bound it on one side alone."""
     low, high = factor.interval.low, factor.interval.high
-    value, sure = f"x{short(factor.value)}", f"with {100.0 * CONFIDENCE:g} %"
-    bound = ""
+    factor_value, confidence = f"x{short(factor.value)}", f"with {100.0 * CONFIDENCE:g} %"
+    bound_of_factor = ""
     if np.isfinite(high):
-        bound = f"at most x{short(high)}"
+        bound_of_factor = f"at most x{short(high)}"
     elif low > 0.0:
-        bound = f"at least x{short(low)}"
+        bound_of_factor = f"at least x{short(low)}"
     if factor.edge:
         limit = np.exp(factor.edge * LIMIT)
-        return f"is at the limit of what is tried, x{limit:g}; {bound or 'not known'} {sure}"
+        return f"is at the limit of what is tried, x{limit:g}; {bound_of_factor or 'not known'} {confidence}"
     if low > 0.0 and np.isfinite(high):
-        return f"{value} [{short(low)}, {short(high)}]"
-    if bound:
-        return f"{value}, {bound} {sure}"
-    return f"{value}, which these data do not bound"
+        return f"{factor_value} [{short(low)}, {short(high)}]"
+    if bound_of_factor:
+        return f"{factor_value}, {bound_of_factor} {confidence}"
+    return f"{factor_value}, which these data do not bound"
 
 
 def _power(verdict: Verdict) -> str:
@@ -185,11 +185,11 @@ def tuning_verdicts(tuning: Tuning) -> dict[str, Verdict]:
 
 def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
     """Write the files of a fit, with its outcome, as a folder that appears whole."""
-    outcome = json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False) + "\n"
-    texts = files(tuning) | {"tuning.json": outcome}
+    tuning_json = json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False) + "\n"
+    texts_by_file = files(tuning) | {"tuning.json": tuning_json}
 
     def contents(at: Path) -> None:
-        for name, text in texts.items():
+        for name, text in texts_by_file.items():
             (at / name).write_text(text, encoding="utf-8")
 
     world = tuning.parts.world

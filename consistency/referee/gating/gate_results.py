@@ -80,16 +80,16 @@ def entry_of(
     )  # fmt: skip
 
 
-def summary_of(look: GateResult) -> dict[str, Any]:
-    summary: dict[str, Any] = {"status": look.status, "reasons": look.reasons}
-    if look.comparison is not None:
-        return summary | {"statistic": plain(look.comparison.differences[0].a)}
-    assert look.verdict is not None
-    v = look.verdict
-    axis, ratio = v.axis or (None, ())
+def summary_of(result: GateResult) -> dict[str, Any]:
+    summary: dict[str, Any] = {"status": result.status, "reasons": result.reasons}
+    if result.comparison is not None:
+        return summary | {"statistic": plain(result.comparison.differences[0].a)}
+    assert result.verdict is not None
+    verdict = result.verdict
+    axis, ratio = verdict.axis or (None, ())
     rest: dict[str, Any] = plain({
-        "statistic": v.statistic, "threshold": v.threshold, "inflation": v.inflation,
-        "inflation_interval": v.inflation_interval, "axis": axis, "axis_ratio": ratio, "first_step": v.first_step,
-        "subset": v.subset, "faults": v.faults,
+        "statistic": verdict.statistic, "threshold": verdict.threshold, "inflation": verdict.inflation,
+        "inflation_interval": verdict.inflation_interval, "axis": axis, "axis_ratio": ratio,
+        "first_step": verdict.first_step, "subset": verdict.subset, "faults": verdict.faults,
     })  # fmt: skip
     return summary | rest

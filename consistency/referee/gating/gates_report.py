@@ -50,11 +50,11 @@ BRIEF = ("test", "gate", "outcome", "p", "runs", "planned", "true / stated", "")
 
 def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:
     columns = tuple(Column(head, number=head in NUMBERS) for head in heads)
-    rows = []
+    gate_rows = []
     for entry in entries:
         cells = _cells(entry)
-        rows.append(tuple(cells[head] for head in heads))
-    return table(columns, rows, "Gates")
+        gate_rows.append(tuple(cells[head] for head in heads))
+    return table(columns, gate_rows, "Gates")
 
 
 def gate_lines(ledger: Ledger) -> list[str]:

@@ -126,14 +126,14 @@ def needed_at(entry: Entry, rate: float) -> int:
 def ending(ledger: Ledger) -> str:
     """How many gates, and the probability that any of them fails a test without a fault."""
     entries = ledger.entries()
-    good = sum(wanted(e) for e in entries)
-    bad = sum(e.outcome != "passed" for e in entries) - good
+    failed_as_expected = sum(wanted(e) for e in entries)
+    failed = sum(e.outcome != "passed" for e in entries) - failed_as_expected
     noun = "gates"
     if len(entries) == 1:
         noun = "gate"
-    text = f"{len(entries)} {noun}, {bad} failed"
-    if good:
-        text += f", {good} failed as expected"
+    text = f"{len(entries)} {noun}, {failed} failed"
+    if failed_as_expected:
+        text += f", {failed_as_expected} failed as expected"
     text += f"; probability that any fails without a fault at most {ledger.bound():.3g}"
     if ledger.rate is not None:
         text += f" (budget {ledger.budget:g}: {ledger.rate:.3g} for a gate)"

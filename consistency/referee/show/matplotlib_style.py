@@ -54,8 +54,8 @@ def canvas(
     figure = Figure(figsize=(width, height))
     grid = figure.subplots(-(-panels // columns), columns, squeeze=False, **shared)
     axes = list(grid.flat)
-    for unused in axes[panels:]:
-        unused.set_axis_off()
+    for empty_panel in axes[panels:]:
+        empty_panel.set_axis_off()
     if shared.get("sharex"):  # a panel with none below it has numbers on its axis
         for number, panel in enumerate(axes[:panels]):
             panel.tick_params(labelbottom=number + columns >= panels)

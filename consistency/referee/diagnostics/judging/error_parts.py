@@ -184,25 +184,25 @@ def by_group_of(
     groups = sample.groups
     if groups is None:
         return None
-    found = [sample.in_group(number) for number in range(len(groups.names))]
-    there = sum(len(one.means) > 0 for one in found)
-    is_asked = any(answer.question == GROUP for answer in given)
+    group_results = [sample.in_group(number) for number in range(len(groups.names))]
+    groups_with_runs = sum(len(one.means) > 0 for one in group_results)
+    group_question_asked = any(answer.question == GROUP for answer in given)
     is_found = GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
-    confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(groups_with_runs, 1)
     from consistency.referee.diagnostics.records.groups_by_column import spans_of
 
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)
-    for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
+    for number, (name, one) in enumerate(zip(groups.names, group_results, strict=True)):
         if not len(one.means):
             continue
         shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
         p_value = float("nan")
         status = ""
-        if is_asked:
-            p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
+        if group_question_asked:
+            p_value = min(1.0, sided_p_value(tests.groups[number], settings) * groups_with_runs)
             is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
         ratio = ratio_interval(one.means, sample.dof, confidence, one.counts)

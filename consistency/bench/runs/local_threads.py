@@ -30,10 +30,13 @@ class LocalThreads:
 
     def prepare(self, work: TrialWork, run: int, /) -> None:
         """Compile what is missing, and take fewer workers where memory lacks for all that ``jobs`` = -1 means."""
-        fitting = work.room_for(run, self._workers)
+        if not work.isolation.compiled:
+            return
+        trial = work.trials(run)
+        fitting = work.room_for(trial, self._workers)
         if self.jobs == -1:
             self._workers = fitting
-        work.compile(run, self._workers)
+        work.compile(trial, self._workers)
 
     def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
         """What each run leaves, in the order in which they end.

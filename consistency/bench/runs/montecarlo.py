@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,7 +16,7 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_threads import LocalThreads
-from consistency.bench.runs.resume_results import PLAN, ResultsPlace, place_for
+from consistency.bench.runs.resume_results import PLAN, gathered_in
 from consistency.bench.runs.rounds_of_runs import Campaign
 from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
@@ -27,7 +27,7 @@ from consistency.bench.store.recorded_log import Log, require_format, write_log
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free
-from consistency.referee.system.provenance import manifest_of, this_machine
+from consistency.referee.system.provenance import manifest_of
 
 
 # fmt: off
@@ -97,10 +97,7 @@ def run_trials(
         scenario, filters, seed, workers_for(jobs, executor), timeout, memory, out=out, previous=previous,
         resume=resume, overwrite=overwrite,
     ) as campaign:  # fmt: skip
-        done = campaign.place.kept
-        is_resumed = campaign.place.journal is not None and campaign.place.journal.runs
-        if done and max(done) >= runs and not is_resumed:
-            raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
+        campaign.gathered.require_more(runs)
         return campaign.finish([range(runs)])
 
 
@@ -139,8 +136,9 @@ def run_log(
     work = TrialWork(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
     own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
     fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
-    with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
-        return Campaign(workers_for(jobs, executor), work, place, fields, log.landmarks).finish([sorted(trials)])
+    place = None if out is None else Path(out)
+    with gathered_in(_known(instances) | own, place, None, resume, overwrite) as gathered:
+        return Campaign(workers_for(jobs, executor), work, gathered, fields, log.landmarks).finish([sorted(trials)])
 
 
 def workers_for(jobs: int, executor: Executor | None) -> Workers:
@@ -177,12 +175,9 @@ def studied(
     planned = {} if plan is None else {PLAN: dict(plan)}
     known = _known(instances) | {"scenario_hash": scenario.hash, "seed": seed} | planned
     fields = {"seed": seed} | _scenario_entry(scenario) | planned
-    with (
-        place_for(known, None if out is None else Path(out), previous, resume, overwrite)
-        if journal is None
-        else nullcontext(ResultsPlace(None, journal, None, frozenset(), [this_machine()]))  # results stay in memory
-    ) as place:
-        yield Campaign(workers, work, place, fields, _landmarks_table(scenario))
+    place = None if out is None else Path(out)
+    with gathered_in(known, place, previous, resume, overwrite, journal) as gathered:
+        yield Campaign(workers, work, gathered, fields, _landmarks_table(scenario))
 
 
 def _known(filters: Sequence[Filter]) -> dict[str, Any]:

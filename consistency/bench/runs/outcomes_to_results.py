@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import astuple, dataclass
 from itertools import pairwise, takewhile
@@ -28,32 +28,13 @@ from consistency.referee.system.stopping import away_from_signals
 from consistency.referee.types import Failure
 
 
-class InMemory:
-    """What a :class:`Journal` keeps, in memory."""
-
-    def __init__(self) -> None:
-        self.notes: dict[int, dict[str, Any]] = {}
-        self._parts: dict[int, Mapping[str, Columns]] = {}
-
-    @property
-    def runs(self) -> set[int]:
-        return set(self._parts)
-
-    def append(self, run: int, parts: Mapping[str, Columns], notes: Mapping[str, Any], /) -> None:
-        if notes:
-            self.notes[run] = dict(notes)
-        self._parts[run] = parts
-
-    def pieces(self, name: str, /) -> Iterator[tuple[int, Columns]]:
-        return ((run, self._parts[run][name]) for run in sorted(self._parts) if name in self._parts[run])
-
-
 class Gathered:
-    """Outcomes of runs of some filters, kept in memory, or where a folder and a journal are given on disk.
+    """Outcomes of runs of some filters, kept in a journal, and their results, in memory or in a folder.
 
     Outcomes come in any order; what is in the journal already counts as theirs. ``errors`` has the convention of each
     filter's own error, where it is not the additive one; only then are there columns for it. ``previous`` are results
-    to which they are added, of which the runs ``kept`` count.
+    to which they are added; of its runs those count that every filter has finished. Other ``machines`` than this one
+    computed some of what is there.
 
     Raises
     ------
@@ -65,17 +46,23 @@ class Gathered:
         self,
         filters: Sequence[str],
         errors: Mapping[str, str],
+        journal: Journal,
         new: NewFolder | None = None,
-        journal: Journal | None = None,
         previous: Tables | None = None,
-        kept: Iterable[int] = (),
+        machines: Sequence[dict[str, str]] = (),
     ) -> None:
-        self.filters, self.new, self.previous, self.kept = list(filters), new, previous, frozenset(kept)
-        self.errors = dict(errors)
+        self.filters, self.errors = list(filters), dict(errors)
+        self.journal, self.new, self.previous = journal, new, previous
+        self.kept = frozenset[int]() if previous is None else frozenset(previous.finished_runs(filters))
+        self.other_machines = list(machines)
         for name in ["", *self.filters]:
             for table in ("estimates", "map") if name else ("truth",):
                 deque(self._before(table, name), maxlen=0)
-        self._now = InMemory() if journal is None else journal
+
+    def require_more(self, runs: int) -> None:
+        """Refuse a number of runs which the previous results exceed, unless there are more to hand over."""
+        if self.kept and max(self.kept) >= runs and not self.journal.runs:
+            raise InputError(f"runs must be at least {max(self.kept) + 1}: so many are there already, got {runs}")
 
     def add(self, outcome: RunOutcome) -> None:
         tables = {f"estimates {name}": columns for name, columns in outcome.estimates.items()}
@@ -84,24 +71,32 @@ class Gathered:
         notes: dict[str, Any] = {"failures": [astuple(failure) for failure in outcome.failures]}
         notes |= {"rejections": outcome.rejections, "machine": outcome.machine}
         with nullcontext() if self.new is None else self.new.writing():
-            self._now.append(outcome.run, tables, {key: rows for key, rows in notes.items() if rows})
+            self.journal.append(outcome.run, tables, {key: rows for key, rows in notes.items() if rows})
 
     @property
     def finished(self) -> set[int]:
         """Runs that are there, those of before too."""
-        return self._now.runs | self.kept
+        return self.journal.runs | self.kept
 
-    def machines(self, before: Sequence[dict[str, str]]) -> list[dict[str, str]]:
-        """Those that computed the runs: the ones ``before``, and the ones of now."""
-        runs_of_now = self._now.runs - self.kept
-        machines_of_runs = [self._now.notes.get(run, {}).get("machine", this_machine()) for run in sorted(runs_of_now)]
-        machines = [*before, *(machines_of_runs or [this_machine()])]
-        return [machine for i, machine in enumerate(machines) if machine not in machines[:i]]
+    @property
+    def is_complete(self) -> bool:
+        """Whether complete results are there and nothing else."""
+        return self.previous is not None and bool(self.previous.manifest["complete"]) and not self.journal.runs
+
+    def machines(self) -> list[dict[str, str]]:
+        """The machines that computed the runs, of before and of now."""
+        this, machines = this_machine(), list(self.other_machines)
+        new_runs = sorted(self.journal.runs - self.kept)
+        noted = [self.journal.notes.get(run, {}).get("machine", this) for run in new_runs]
+        for machine in noted or [this]:
+            if machine not in machines:
+                machines.append(machine)
+        return machines
 
     def pieces(self, table: str, filter_name: str = "") -> Iterator[Columns]:
         """Rows of ``estimates`` or ``map`` of a filter, or of ``truth``, run by run in order of the runs."""
         part = f"{table} {filter_name}" if filter_name else table
-        now = ((run, columns) for run, columns in self._now.pieces(part) if run not in self.kept)
+        now = ((run, columns) for run, columns in self.journal.pieces(part) if run not in self.kept)
         merged = heapq.merge(self._before(table, filter_name), now, key=itemgetter(0))
         return (columns for _, columns in merged if len(columns["run"]))
 
@@ -175,7 +170,7 @@ class Gathered:
             before: pd.DataFrame | None = None if self.previous is None else getattr(self.previous, key)
             rows = [] if before is None else [kind(*row) for row in before.itertuples(index=False)]
             rows = [row for row in rows if row.run in self.kept and row.filter in rank]
-            for run, notes in self._now.notes.items():
+            for run, notes in self.journal.notes.items():
                 rows += [kind(*row) for row in notes.get(key, ()) if run not in self.kept]
             tables.append(noted_table(key, sorted(rows, key=lambda row: (rank[row.filter], row.run))))
         failures, rejections = tables

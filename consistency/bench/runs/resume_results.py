@@ -1,14 +1,14 @@
-"""The place of results, and what of a study is there already, for a resume."""
+"""What of a study is there already, in a folder of results and in a journal, and may be continued."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from consistency.bench.store.journal import Journal, Unfinished
+from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.store.journal import IN_MEMORY, Journal, Unfinished
 from consistency.bench.store.results import StoredResults, Tables, open_results
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import NewFolder
@@ -16,50 +16,38 @@ from consistency.referee.system.progress import say
 from consistency.referee.system.provenance import in_words, this_machine
 
 PLAN = "until_decided"
-
-
 KEYS = {
     "scenario_hash": "scenario", "log_sha256": "log", "filters": "filter", "error": "error of a filter", "seed": "seed",
     "screening": "--screen", PLAN: "plan of looks",
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class ResultsPlace:
-    """Place of the results, with the runs ``kept`` of previous results, and those in the journal.
-
-    ``machines`` are those that computed a part of the results, this one last.
-    """
-
-    new: NewFolder | None
-    journal: Journal | None
-    previous: Tables | None
-    kept: frozenset[int]
-    machines: list[dict[str, str]]
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the place holds complete results and nothing else."""
-        more = self.journal is not None and self.journal.runs
-        return self.previous is not None and bool(self.previous.manifest["complete"]) and not more
-
-
 @contextmanager
-def place_for(
-    study: Mapping[str, Any], out: Path | None, previous: Tables | None, resume: bool, overwrite: bool
-) -> Iterator[ResultsPlace]:
-    """The place of the results of a ``study``, which is known by :data:`KEYS`; nothing but memory without ``out``.
+def gathered_in(
+    study: Mapping[str, Any],
+    out: Path | None,
+    previous: Tables | None,
+    resume: bool,
+    overwrite: bool,
+    journal: Journal | None = None,
+) -> Iterator[Gathered]:
+    """Yield what there is of a ``study``, which is known by :data:`KEYS`, to be continued.
 
-    With ``resume``, or where ``previous`` are the results in ``out``, what is in ``out`` and in its journal is gone on
-    with, and whatever else is in the folder stays.
+    Results go to ``out``, or stay in memory. A ``journal`` in its place keeps the finished runs of results in memory.
+    With ``resume``, or where ``previous`` are the results in ``out``, what is in ``out`` and in its journal is
+    continued, and whatever else is in the folder stays.
 
     Raises
     ------
     InputError
         What is there is of another study; ``out`` cannot be written, or is taken; unfinished work is in the way.
     """
+    if journal is not None:
+        yield Gathered(study["filters"], study["error"], journal)
+        return
     if out is None:
-        yield _place(study, None, None, previous)
+        with closing(Journal(IN_MEMORY)) as in_memory:
+            yield _gathered(study, in_memory, None, previous)
         return
     resume = resume or (isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve())
     with Unfinished(out, resume, overwrite) as unfinished:
@@ -71,12 +59,13 @@ def place_for(
             previous = open_results(out)
         goes_on = resume and not replaces and out.exists()
         with NewFolder(out, "results", replaces or goes_on, goes_on, within=unfinished.path) as new:
-            place = _place(study, new, unfinished.journal, previous)
-            unfinished.journal.begin(dict(study) | {"overwrite": replaces, "machines": place.machines})
+            gathered = _gathered(study, unfinished.journal, new, previous)
+            machines = [*gathered.other_machines, this_machine()]
+            unfinished.journal.begin(dict(study) | {"overwrite": replaces, "machines": machines})
             try:
-                yield place
+                yield gathered
             except InputError as error:
-                finished = len(place.kept | unfinished.journal.runs)
+                finished = len(gathered.finished)
                 if new.is_placed or not finished or not isinstance(error.__cause__, OSError):
                     raise
                 raise InputError(
@@ -86,11 +75,9 @@ def place_for(
                 unfinished.is_over = new.is_placed
 
 
-def _place(
-    study: Mapping[str, Any], new: NewFolder | None, journal: Journal | None, previous: Tables | None
-) -> ResultsPlace:
+def _gathered(study: Mapping[str, Any], journal: Journal, new: NewFolder | None, previous: Tables | None) -> Gathered:
     sources = [{}] if previous is None else [previous.manifest]
-    sources += [] if journal is None or not journal.runs else [journal.study]
+    sources += [journal.study] if journal.runs else []
     machines: list[dict[str, str]] = []
     for source in sources:
         _require_same(study, source)
@@ -101,8 +88,7 @@ def _place(
             f"consistency: {in_words(others)} computed the runs that are there, this is {in_words([this])}: "
             "the last digits of the others may differ from those of one machine"
         )
-    kept = frozenset() if previous is None else frozenset(previous.finished_runs(study["filters"]))
-    return ResultsPlace(new, journal, previous, kept, [*others, this])
+    return Gathered(study["filters"], study["error"], journal, new, previous, others)
 
 
 def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:

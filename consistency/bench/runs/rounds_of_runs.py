@@ -1,4 +1,4 @@
-"""A number of runs, done by a backend and kept in their place as they come, beside those of before."""
+"""Rounds of runs: each has the runs of those before and more, and what they leave is gathered as it comes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.filters.filter_declarations import name_of, optimal_gain, own_errors
+from consistency.bench.filters.filter_declarations import name_of, optimal_gain
 from consistency.bench.runs.outcomes_to_results import Gathered, SoFar
-from consistency.bench.runs.resume_results import ResultsPlace
 from consistency.bench.runs.trial_work import TrialWork, Workers
 from consistency.bench.store.results import Results, StoredResults
 from consistency.referee.system.progress import progress
@@ -32,7 +31,7 @@ class Campaign:
     Parameters
     ----------
     workers, work : who does the runs, and what is done for each
-    place : where results go, and what is there
+    gathered : where outcomes go, and what is there
     fields : of the manifest
     landmarks : table of those of the world, where they are known
     """
@@ -41,16 +40,16 @@ class Campaign:
         self,
         workers: Workers,
         work: TrialWork,
-        place: ResultsPlace,
+        gathered: Gathered,
         fields: Mapping[str, Any],
         landmarks: pd.DataFrame | None,
     ) -> None:
-        self.workers, self.work, self.place, self.landmarks = workers, work, place, landmarks
-        names, errors = [name_of(f) for f in work.filters], own_errors(work.filters)
-        self.gathered = Gathered(names, errors, place.new, place.journal, place.previous, place.kept)
+        self.workers, self.work, self.gathered, self.landmarks = workers, work, gathered, landmarks
         gains = [name_of(f) for f in work.filters if optimal_gain(f)]
-        self._fields = dict(fields) | {"machines": place.machines, "filters": names, "optimal_gain": gains}
-        self._fields |= {"error": errors} if errors else {}
+        machines, filters = gathered.other_machines, gathered.filters
+        self._fields = dict(fields) | {"machines": machines, "filters": filters, "optimal_gain": gains}
+        if gathered.errors:
+            self._fields["error"] = gathered.errors
 
     def so_far(self, runs: int) -> SoFar:
         """Runs 0 to ``runs`` - 1 of what is there, to be read while more come."""
@@ -82,7 +81,7 @@ class Campaign:
                 if todo:
                     self._do(todo)
         except KeyboardInterrupt:
-            if self.place.journal is not None:
+            if self.gathered.journal.is_on_disk:
                 raise
             raise Interrupted(self._results(runs, started)) from None
         return self._results(runs, started)
@@ -98,7 +97,7 @@ class Campaign:
         finished = self.gathered.finished
         runs_beyond = finished.difference(runs)
         total = max(runs_beyond) + 1 if runs_beyond else len(runs)
-        fields = self._fields | {"machines": self.gathered.machines(self.place.machines[:-1])}
+        fields = self._fields | {"machines": self.gathered.machines()}
         is_complete = len(finished) == total
         if not is_complete:
             fields["finished_runs"] = len(finished)

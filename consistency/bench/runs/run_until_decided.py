@@ -100,7 +100,7 @@ def _rounds(
         yield range(runs)
     if is_new:
         say(f"{runs} runs: {progress_text(decided, names)}")
-    elif campaign.place.is_complete:
+    elif campaign.gathered.is_complete:
         done = len(campaign.gathered.finished)
         raise InputError(f"the {done} runs of the results to resume have decided every filter")
 
@@ -109,7 +109,7 @@ def _require_less(campaign: Campaign, max_runs: int | None) -> None:
     """Refuse results to which no run can be added."""
     done = campaign.gathered.finished
     before = next(run for run in count() if run not in done)
-    if max_runs is not None and (before > max_runs or (before == max_runs and campaign.place.is_complete)):
+    if max_runs is not None and (before > max_runs or (before == max_runs and campaign.gathered.is_complete)):
         raise InputError(f"the results to resume have {before} runs; the plan looks for the last time at {max_runs}")
 
 

@@ -25,6 +25,7 @@ from consistency.referee.types import Array
 
 CHECKPOINT_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none
 DATABASE, EARLIER = "runs.sqlite", "journal"  # the second is of versions before SQLite
+IN_MEMORY = Path(":memory:")
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS study (content TEXT);
 CREATE TABLE IF NOT EXISTS finished (run INTEGER PRIMARY KEY, notes TEXT);
@@ -35,7 +36,7 @@ CREATE TABLE IF NOT EXISTS part (
 
 
 class Journal:
-    """Finished runs in an SQLite database.
+    """Finished runs in an SQLite database, in a file or ``IN_MEMORY``.
 
     A finished run is a row of ``finished`` and, for each of its tables, a row of ``part``: the names and types of the
     columns, and their numbers as they are in memory. Both are written in one transaction, so that a run is there
@@ -77,6 +78,10 @@ class Journal:
         self._database.execute("PRAGMA synchronous = NORMAL")
         self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
         self._database.executescript(SCHEMA)
+
+    @property
+    def is_on_disk(self) -> bool:
+        return self.path != IN_MEMORY
 
     @property
     def runs(self) -> set[int]:

@@ -191,7 +191,11 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
         raise InputError(f"{unknown('sweep', str(name), sweep_names())}; or give a .toml file or a folder of 'sweep'")
     file = read_table(path, SweepFile)
     try:
-        sweep = _sweep(path, file, tuple(filters or file.filters))
+        beside = path.parent / file.base
+        base = load_scenario(beside if file.base.endswith(".toml") else file.base)
+        if filters:
+            file = file.model_copy(update={"filters": list(filters)})
+        sweep = sweep_of(path.stem, file, base)
         plan_of(sweep.rule.model_dump() | {"dof": len(POSE)})
         for filter_ in sweep.filters:
             get_filter(filter_)
@@ -202,16 +206,24 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
     return sweep
 
 
-def _sweep(path: Path, file: SweepFile, filters: tuple[str, ...]) -> Sweep:
-    beside = path.parent / file.base
-    base = load_scenario(beside if file.base.endswith(".toml") else file.base)
+def sweep_of(name: str, file: SweepFile, base: Scenario) -> Sweep:
+    """Expand the content of a sweep's file; the cells are made when they are asked for.
+
+    Raises
+    ------
+    InputError
+        A key of no scenario, a value that may not be, or too many cells.
+    """
     if not (file.grid or file.alone):
         raise InputError("key 'grid': missing; give it axes, or a table 'alone' of axes that vary one at a time")
     if both := [key for key in file.grid if key in file.alone]:
         raise InputError(f"key 'alone.{both[0]}': stands in 'grid', too; leave one of them out")
     axes = [_axis("grid", key, values, base) for key, values in file.grid.items()]
     axes += [_axis("alone", key, values, base) for key, values in file.alone.items()]
-    return Sweep(path.stem, file.summary, base, tuple(axes), filters, file.seed, file.rule)
+    count = number_of_points(axes)
+    if count > MOST_CELLS:
+        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
+    return Sweep(name, file.summary, base, tuple(axes), tuple(file.filters), file.seed, file.rule)
 
 
 def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
@@ -267,9 +279,6 @@ def _require_cells(sweep: Sweep) -> None:
                 raise InputError(f"keys {both} both set {key}; leave one of them out")
         if axis.home is None:  # axes that vary alone never meet
             axis_by_key |= dict.fromkeys(keys, axis.key)
-    count = number_of_points(sweep.axes)
-    if count > MOST_CELLS:
-        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
     try:
         names = Counter(cell.name for cell in sweep.cells)
     except ValueError as error:

@@ -15,8 +15,7 @@ from consistency.bench.scenario import Scenario
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.journal import Journal, Unfinished
 from consistency.bench.sweeps.run_cell import CellOutcome, CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.sweep_axes import Axis
-from consistency.bench.sweeps.sweep_file import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
+from consistency.bench.sweeps.sweep_file import Cell, Sweep, SweepFile, sweep_of
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
 from consistency.referee.system.atomic import write_whole
@@ -218,26 +217,15 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
         It is damaged.
     """
     with reading(path, "key 'sweep' is damaged; write it again"):
-        data = manifest["sweep"]
-        base = Scenario.model_validate(data["base"])
-        axes = [Axis(key, _listed(values)) for key, values in data["grid"].items()]
-        axes += [alone(Axis(key, _listed(values)), base) for key, values in data.get("alone", {}).items()]
-        filters = _listed(data["filters"])
-        if not all(isinstance(name, str) for name in filters):
-            raise ValueError("filters must be names")
-        if number_of_points(axes) > MOST_CELLS:
-            raise ValueError(f"more than {MOST_CELLS} cells")
-        rule = StoppingRule.model_validate(data["rule"])
-        name, summary, seed = str(data["name"]), str(data["summary"]), int(data["seed"])
-        sweep = Sweep(name, summary, base, tuple(axes), filters, seed, rule)
+        content = dict(manifest["sweep"])
+        name, base = str(content.pop("name")), Scenario.model_validate(content.pop("base"))
+        file = SweepFile.model_validate(content | {"base": base.name})
+        try:
+            sweep = sweep_of(name, file, base)
+        except InputError as error:
+            raise ValueError(str(error)) from None
         _ = sweep.cells  # each is checked when it is made
         return sweep
-
-
-def _listed(values: Any) -> tuple[Any, ...]:
-    if not isinstance(values, list) or not values:
-        raise ValueError("filters and values must be lists")
-    return tuple(values)
 
 
 def open_sweep(path: Path) -> SweepFolder:

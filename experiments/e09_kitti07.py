@@ -32,7 +32,7 @@ from consistency.bench.store.recorded_log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.diagnostics import anees_interval, chi2_mean_interval
-from consistency.referee.diagnostics.statistics.accuracy import coverage
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import coverage
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 

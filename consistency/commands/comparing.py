@@ -25,7 +25,7 @@ from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.records.skipping import Skip as FirstSteps
+    from consistency.referee.diagnostics.records.skipped_start import Skip as FirstSteps
     from consistency.referee.verdicts.baselines import Baseline
     from consistency.referee.verdicts.judge_sources import Source
 

@@ -1,7 +1,7 @@
 """Pages on results of the bench and on maps of worlds.
 
-``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
-is described once.
+``results_report`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each
+of which is described once.
 """
 
 from __future__ import annotations

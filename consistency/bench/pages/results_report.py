@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.pages.sections import overview, published_findings
+from consistency.bench.pages.sections import published_findings, several_studies
 from consistency.bench.pages.sections.calibration_rates import calibration_rates
 from consistency.bench.pages.sections.filters_table import filters_table
-from consistency.bench.pages.sections.overview import provenance
 from consistency.bench.pages.sections.report_input import Report, Study, Track
+from consistency.bench.pages.sections.several_studies import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
 from consistency.bench.runs.experiment_scripts import figure_scripts
 from consistency.bench.runs.reproduce_findings import read_findings
@@ -111,14 +111,14 @@ def compose(report: Report) -> Document:
         Chapter("findings", "Findings: published beside measured", "Findings", published_findings.all_findings(report),
                 on_paper=published_findings.findings_on_paper(report)),
         Chapter("filters", "Filters side by side", "Filters", filters_table(report)),
-        Chapter("verdicts", "Verdicts", "Verdicts", overview.verdicts(report), on_paper=only_page),
+        Chapter("verdicts", "Verdicts", "Verdicts", several_studies.verdicts(report), on_paper=only_page),
         *(_study_chapter(index, study, brief) for index, study in enumerate(report.studies)),
         *_of_experiments(report, brief),
         Chapter("calibration", "How far the referee can be trusted", "The referee", calibration_rates(), on_paper=()),
         Chapter("provenance", "Provenance", "Provenance", provenance(report), on_paper=only_page),
     )  # fmt: skip
     shown = tuple(chapter for chapter in chapters if chapter.blocks)
-    return Document(report.title, answer(report.studies, report.findings), shown, overview.opening(report))
+    return Document(report.title, answer(report.studies, report.findings), shown, several_studies.opening(report))
 
 
 def _of_experiments(report: Report, brief: bool) -> list[Chapter]:
@@ -133,7 +133,7 @@ def _of_experiments(report: Report, brief: bool) -> list[Chapter]:
 
 def _study_chapter(index: int, study: Study, brief: bool) -> Chapter:
     blocks = tuple(block for section in SECTIONS for block in section(study))
-    on_paper = overview.on_paper(study, blocks) if brief else None
+    on_paper = several_studies.on_paper(study, blocks) if brief else None
     return Chapter(f"study-{index}", study.name, study.name, blocks, study.summary, study.switches, on_paper)
 
 
@@ -142,7 +142,7 @@ def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     pairs = [(track, study) for study in studies for track in study.tracks]
     text = []
     if len(studies) > 1:
-        text.append(overview.main_sentence(studies))
+        text.append(several_studies.main_sentence(studies))
     if findings:
         text.append(_finding_sentence(findings))
     if pairs:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor
-from consistency.bench.simulation.variation import (
+from consistency.bench.simulation.scenario_changes import (
     Changes,
     baseline_changes,
     course_of,

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.gating.checked_arrays import record_of_checked, record_of_filter
 
 if TYPE_CHECKING:

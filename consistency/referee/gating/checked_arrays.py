@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.questions.innovations import nis_of
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip, skip_of
+from consistency.referee.diagnostics.records.skipped_start import Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN
 from consistency.referee.document.blocks import Block, Cell, Column, Details, Figure, Quantity, table

@@ -18,7 +18,7 @@ import numpy as np
 from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict

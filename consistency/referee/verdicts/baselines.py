@@ -14,7 +14,7 @@ import numpy as np
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.comparison import RunSummary, summary
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading

@@ -16,7 +16,7 @@ from consistency.referee.readers.pipeline.read_files import is_program_runs
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
-    from consistency.referee.diagnostics.records.skipping import Skip
+    from consistency.referee.diagnostics.records.skipped_start import Skip
 
 OPTION = {"ratio": "detect", "false_alarm": "false-alarm", "max_runs": "max-runs"}  # as commands call settings
 
@@ -127,7 +127,7 @@ def skip_asked(given: str | float | Skip | None) -> Skip | None:
     """
     if given is None:
         return None
-    from consistency.referee.diagnostics.records.skipping import skip_of
+    from consistency.referee.diagnostics.records.skipped_start import skip_of
 
     try:
         return skip_of(given)

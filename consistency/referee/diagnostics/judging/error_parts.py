@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.judging.fault_location import from_step, location_of
 from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
-from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
+from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
@@ -19,7 +19,12 @@ from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
-from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import (
+    coverage,
+    coverage_interval,
+    noncredibility,
+    rmse,
+)
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.statistics.number_of_runs import detectable_ratio
 from consistency.referee.diagnostics.verdict.answers import (

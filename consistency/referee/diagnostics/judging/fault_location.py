@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.band import Band
+from consistency.referee.diagnostics.questions.anees_band import Band
 from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.statistics import distributions

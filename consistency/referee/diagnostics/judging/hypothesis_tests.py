@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
+from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import StepMoments, hotelling, step_moments, t_squared
 from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.questions.sample import Sample

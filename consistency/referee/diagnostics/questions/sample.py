@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.validity import negative
+from consistency.referee.diagnostics.records.valid_covariances import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices

@@ -15,7 +15,7 @@ from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.groups_by_column import Groups
-    from consistency.referee.diagnostics.records.skipping import Skip, Skipped
+    from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Record:
         """
         if skip is None:
             return self
-        from consistency.referee.diagnostics.records.skipping import without_first
+        from consistency.referee.diagnostics.records.skipped_start import without_first
 
         arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
         world = self.world

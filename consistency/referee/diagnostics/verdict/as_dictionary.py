@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.skipping import Skipped
+from consistency.referee.diagnostics.records.skipped_start import Skipped
 from consistency.referee.diagnostics.verdict.parts import (
     Bias,
     ByGroup,

@@ -9,7 +9,7 @@ import numpy as np
 from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
 from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict

@@ -110,14 +110,17 @@ class Choice:
 
     def within(self, text: str) -> Choice:
         """The dimension with fewer values, ``A,B``."""
-        known = {_text(value): value for value in self.values}
-        parts = [part.strip() for part in text.split(",")]
-        if unknown := [part for part in parts if part not in known]:
-            some = list(known) if len(known) <= len(SHAPES) + 1 else [*list(known)[:3], "...", list(known)[-1]]
+        values_by_text = {_text(value): value for value in self.values}
+        chosen_values = [part.strip() for part in text.split(",")]
+        if unknown_values := [part for part in chosen_values if part not in values_by_text]:
+            names = list(values_by_text)
+            if len(names) > len(SHAPES) + 1:
+                names = [*names[:3], "...", names[-1]]
             raise InputError(
-                f"--within {self.name}={text}: '{unknown[0]}' is not one of its values; choose from {', '.join(some)}"
+                f"--within {self.name}={text}: '{unknown_values[0]}' is not one of its values; choose from "
+                f"{', '.join(names)}"
             )
-        return replace(self, values=tuple(known[part] for part in dict.fromkeys(parts)))
+        return replace(self, values=tuple(values_by_text[part] for part in dict.fromkeys(chosen_values)))
 
     def text(self, value: Value) -> str:
         return f"{_text(value)}{self.unit}"

@@ -140,39 +140,39 @@ def _study_chapter(index: int, study: Study, brief: bool) -> Chapter:
 def answer(studies: Sequence[Study], findings: Sequence[dict[str, Any]]) -> str:
     """Who is honest and who is not, in one paragraph."""
     pairs = [(track, study) for study in studies for track in study.tracks]
-    text = []
+    sentences = []
     if len(studies) > 1:
-        text.append(several_studies.main_sentence(studies))
+        sentences.append(several_studies.main_sentence(studies))
     if findings:
-        text.append(_finding_sentence(findings))
+        sentences.append(_finding_sentence(findings))
     if pairs:
-        text.append(_count_sentence(studies, [track for track, _ in pairs]))
+        sentences.append(_count_sentence(studies, [track for track, _ in pairs]))
         if len(studies) == 1:
-            text += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs))]
-        text.append(_failure_sentence(studies))
+            sentences += [sentence for status in STATUSES if (sentence := _status_sentence(status, pairs))]
+        sentences.append(_failure_sentence(studies))
     if any(track.innovations_judged and not study.has_truth for track, study in pairs):
-        text.append(
+        sentences.append(
             "Where the truth is not known the innovations alone decide, if the filter declares an optimal gain; they "
             "cannot see most pose errors."
         )
-    return " ".join(filter(None, text)) or "This folder holds neither results nor findings."
+    return " ".join(filter(None, sentences)) or "This folder holds neither results nor findings."
 
 
 def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
     """How many pairs of filter and scenario passed, and what."""
-    honest = sum(track.verdict.consistent for track in tracks)
-    one = honest == 1 or len(tracks) == 1
-    passed = f"{'is' if one else 'are'} shown to be honest about the uncertainty of the pose"
-    nothing = False
+    honest_filters = sum(track.verdict.consistent for track in tracks)
+    is_singular = honest_filters == 1 or len(tracks) == 1
+    what_passed = f"{'is' if is_singular else 'are'} shown to be honest about the uncertainty of the pose"
+    nothing_judged = False
     if not any(study.has_truth for study in studies):
-        passed = f"{'passes' if one else 'pass'} the test of the innovations, the only one without truth"
-        nothing = not any(track.innovations_judged for track in tracks)
+        what_passed = f"{'passes' if is_singular else 'pass'} the test of the innovations, the only one without truth"
+        nothing_judged = not any(track.innovations_judged for track in tracks)
     unknown = "no filter can be judged: the truth is not known, and none declares an optimal gain"
     if len(studies) == 1:
-        size = f"{plural(studies[0].runs, 'run')} of {plural(len(studies[0].steps), 'step')}"
-        count = unknown if nothing else f"{honest} of {plural(len(tracks), 'filter')} {passed}"
-        return f"In {studies[0].name} ({size}), {count}."
-    if nothing:
+        study_size = f"{plural(studies[0].runs, 'run')} of {plural(len(studies[0].steps), 'step')}"
+        count = unknown if nothing_judged else f"{honest_filters} of {plural(len(tracks), 'filter')} {what_passed}"
+        return f"In {studies[0].name} ({study_size}), {count}."
+    if nothing_judged:
         return f"{unknown[:1].upper()}{unknown[1:]}."
     statuses = Counter(track.verdict.status for track in tracks)
     counts = [f"{statuses[status]} {status}" for status in STATUSES if statuses[status]]

@@ -79,13 +79,13 @@ def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
 
 
 def _compile(missing: Sequence[Need], jobs: int) -> None:
-    shared = [need for need in missing if need.outlook.is_shared]
-    workers = min(jobs, len(shared))
+    shared_kernels = [need for need in missing if need.outlook.is_shared]
+    workers = min(jobs, len(shared_kernels))
     if disk_cache.folder_fault():
         workers = 1
     progress.announce(f"{_label(missing)}, once: {EACH}")
     if workers > 1:
-        _compile_side_by_side(shared, workers)
+        _compile_side_by_side(shared_kernels, workers)
     away_from_signals(_compile_here, missing)
 
 
@@ -96,11 +96,11 @@ def _compile_here(needs: Sequence[Need]) -> None:
 
 
 def _label(missing: Sequence[Need]) -> str:
-    names = list(dict.fromkeys(name_of(need.filter) for need in missing))
+    filter_names = list(dict.fromkeys(name_of(need.filter) for need in missing))
     if len(missing) == 1:
-        return f"compiling the kernel of {names[0]}"
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return f"compiling {len(missing)} kernels of {', '.join(names[:NAMED])}{more}"
+        return f"compiling the kernel of {filter_names[0]}"
+    further_filters = f" and {len(filter_names) - NAMED} more" if len(filter_names) > NAMED else ""
+    return f"compiling {len(missing)} kernels of {', '.join(filter_names[:NAMED])}{further_filters}"
 
 
 # --- side by side ---------------------------------------------------------------------------------

@@ -95,10 +95,10 @@ class Gathered:
 
     def pieces(self, table: str, filter_name: str = "") -> Iterator[Columns]:
         """Rows of ``estimates`` or ``map`` of a filter, or of ``truth``, run by run in order of the runs."""
-        part = f"{table} {filter_name}" if filter_name else table
-        now = ((run, columns) for run, columns in self.journal.pieces(part) if run not in self.kept)
-        merged = heapq.merge(self._before(table, filter_name), now, key=itemgetter(0))
-        return (columns for _, columns in merged if len(columns["run"]))
+        table_of_filter = f"{table} {filter_name}" if filter_name else table
+        new_pieces = ((run, columns) for run, columns in self.journal.pieces(table_of_filter) if run not in self.kept)
+        pieces_by_run = heapq.merge(self._before(table, filter_name), new_pieces, key=itemgetter(0))
+        return (columns for _, columns in pieces_by_run if len(columns["run"]))
 
     def results(self, manifest: dict[str, Any], landmarks: pd.DataFrame | None) -> Results | StoredResults:
         """The results; a folder is written and put in its place, unless no run is finished."""
@@ -153,26 +153,26 @@ class Gathered:
             columns = self.previous.map_numbers
         elif table == "estimates":
             columns = OWN_NUMBERS if filter_name in self.errors else NUMBERS
-        last = -1
+        last_run = -1
         for batch in self.previous.batches(table, columns, filter_name or None):
-            for start, end in pairwise(np.flatnonzero(np.diff(batch["run"], prepend=-1, append=-1))):
-                run = int(batch["run"][start])
-                if run < last:
+            for first_row, end_row in pairwise(np.flatnonzero(np.diff(batch["run"], prepend=-1, append=-1))):
+                run = int(batch["run"][first_row])
+                if run < last_run:
                     raise InputError(f"the {table} to resume must be in order of the runs, as they were written")
-                last = run
+                last_run = run
                 if run in self.kept:
-                    yield run, {name: values[start:end] for name, values in batch.items()}
+                    yield run, {name: values[first_row:end_row] for name, values in batch.items()}
 
     def noted(self) -> tuple[pd.DataFrame, pd.DataFrame | None]:
         """Failures, and rejections where a filter has a guard, of before and of now, by filter and run."""
-        rank, tables = {name: i for i, name in enumerate(self.filters)}, []
-        for key, kind in (("failures", Failure), ("rejections", Rejected)):
-            before: pd.DataFrame | None = None if self.previous is None else getattr(self.previous, key)
-            rows = [] if before is None else [kind(*row) for row in before.itertuples(index=False)]
-            rows = [row for row in rows if row.run in self.kept and row.filter in rank]
+        filter_order, tables = {name: i for i, name in enumerate(self.filters)}, []
+        for table_name, kind in (("failures", Failure), ("rejections", Rejected)):
+            table_before: pd.DataFrame | None = None if self.previous is None else getattr(self.previous, table_name)
+            rows = [] if table_before is None else [kind(*row) for row in table_before.itertuples(index=False)]
+            rows = [row for row in rows if row.run in self.kept and row.filter in filter_order]
             for run, notes in self.journal.notes.items():
-                rows += [kind(*row) for row in notes.get(key, ()) if run not in self.kept]
-            tables.append(noted_table(key, sorted(rows, key=lambda row: (rank[row.filter], row.run))))
+                rows += [kind(*row) for row in notes.get(table_name, ()) if run not in self.kept]
+            tables.append(noted_table(table_name, sorted(rows, key=lambda row: (filter_order[row.filter], row.run))))
         failures, rejections = tables
         return failures, rejections if len(rejections) else None
 
@@ -199,5 +199,5 @@ class SoFar(Tables):
     def batches(self, table: str, columns: Sequence[str], filter_name: str | None = None) -> Iterator[Columns]:
         for name in self.filters if filter_name is None and table != "truth" else [filter_name or ""]:
             for piece in takewhile(lambda piece: piece["run"][0] < self.runs, self.gathered.pieces(table, name)):
-                nothing = np.full(len(piece["run"]), np.nan)
-                yield {column: piece.get(column, nothing) for column in columns}
+                all_nan = np.full(len(piece["run"]), np.nan)
+                yield {column: piece.get(column, all_nan) for column in columns}

@@ -38,8 +38,8 @@ def _pilot_means(of: Record) -> Array:
     """Mean NEES over dof of the runs that did not fail, (runs,)."""
     if of.nees is None:
         raise InputError(f"{of.name}: has no truth; only runs with a NEES tell how their steps depend on each other")
-    means = mean_nees_of_runs(of)
-    means = means[np.isfinite(means)] / len(POSE)
-    if len(means) < FEW:
-        raise InputError(f"{of.name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
-    return np.asarray(means)
+    mean_nees = mean_nees_of_runs(of)
+    mean_nees = mean_nees[np.isfinite(mean_nees)] / len(POSE)
+    if len(mean_nees) < FEW:
+        raise InputError(f"{of.name}: a pilot needs at least {FEW} runs that did not fail, got {len(mean_nees)}")
+    return np.asarray(mean_nees)

@@ -71,14 +71,14 @@ class Study:
     def results(self, scenario: str | Scenario, filters: Sequence[str]) -> Results:
         """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
         world = load_scenario(scenario) if isinstance(scenario, str) else scenario
-        have = self.kept.get(world.name)
-        if have is not None and have.manifest["scenario_hash"] != world.hash:
+        results_so_far = self.kept.get(world.name)
+        if results_so_far is not None and results_so_far.manifest["scenario_hash"] != world.hash:
             raise ValueError(f"two different scenarios are named '{world.name}'")
-        missing = [name for name in filters if have is None or name not in have.filters]
-        if missing:
-            say(f"{world.name}: {', '.join(missing)}")
-            new = run_trials(world, missing, self.runs, self.seed, self.jobs)
-            self.kept[world.name] = new if have is None else joined([have, new])
+        missing_filters = [name for name in filters if results_so_far is None or name not in results_so_far.filters]
+        if missing_filters:
+            say(f"{world.name}: {', '.join(missing_filters)}")
+            new_results = run_trials(world, missing_filters, self.runs, self.seed, self.jobs)
+            self.kept[world.name] = new_results if results_so_far is None else joined([results_so_far, new_results])
         return self.kept[world.name]
 
     def judged(self, scenario: str | Scenario, filter_name: str) -> tuple[Verdict, Record]:
@@ -165,25 +165,26 @@ def _selection(
     scripts: Mapping[str, ModuleType], only: Sequence[str], long: bool
 ) -> list[tuple[ModuleType, Sequence[str]]]:
     """The scripts to run, in order, each with the ids of its findings that are wanted."""
-    known = [finding for module in scripts.values() for finding in module.FINDINGS]
-    if unknown := [name for name in only if name not in known]:
-        raise InputError(f"--only {unknown[0]}: no such finding or experiment; known: {', '.join([*known, *scripts])}")
-    pairs = [
+    known_findings = [finding for module in scripts.values() for finding in module.FINDINGS]
+    if unknown := [name for name in only if name not in known_findings]:
+        known = ", ".join([*known_findings, *scripts])
+        raise InputError(f"--only {unknown[0]}: no such finding or experiment; known: {known}")
+    scripts_and_findings = [
         (module, [name for name in module.FINDINGS if not only or name in only])
         for module in scripts.values()
         if only or long or not getattr(module, "LONG", False)
     ]
-    return [(module, ids) for module, ids in pairs if ids]
+    return [(module, ids) for module, ids in scripts_and_findings if ids]
 
 
 def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:
     """The wanted findings in order of their scripts, whichever script ends first."""
-    apart = [module for module, _ in selection if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
+    in_own_process = [module for module, _ in selection if study.workers > 1 and getattr(module, "OWN_PROCESS", False)]
     context = get_context("loky")
     pool = None
-    if apart:
-        ends = {"initializer": end_with_parent, "initargs": link_to_parent(context)}
-        pool = ProcessPoolExecutor(len(apart), context=context, **ends)
+    if in_own_process:
+        initializer = {"initializer": end_with_parent, "initargs": link_to_parent(context)}
+        pool = ProcessPoolExecutor(len(in_own_process), context=context, **initializer)
     futures: dict[ModuleType, Future[_Contribution]] = {}
 
     def main(module: ModuleType) -> list[Finding]:
@@ -196,7 +197,7 @@ def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[st
 
     by_script: dict[ModuleType, list[Finding]] = {}
     try:
-        for module in apart:
+        for module in in_own_process:
             assert pool is not None
             futures[module] = pool.submit(_contribution, module.__file__, study.runs, study.seed, study.jobs)
         ordered = sorted(selection, key=lambda pair: pair[0] in futures)  # processes are waited for last
@@ -242,9 +243,9 @@ def _guarded(
         raise
     except Exception as error:
         claim = summary_of(module)
-        text = dict.fromkeys(("source", "statistic", "published", "accept"), "the experiment broke before it said")
+        unsaid = dict.fromkeys(("source", "statistic", "published", "accept"), "the experiment broke before it said")
         measured = f"{type(error).__name__}: {error}"
-        return [study.finding(False, "none", id=name, claim=claim, measured=measured, **text) for name in ids]
+        return [study.finding(False, "none", id=name, claim=claim, measured=measured, **unsaid) for name in ids]
 
 
 def script(main: Callable[[Study], list[Finding]], arguments: Sequence[str] | None = None) -> None:
@@ -263,11 +264,11 @@ def read_findings(folder: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with reading(path, "not a list of findings"):
-        entries, keys = read_json(path), [each.name for each in fields(Finding)]
+        entries, finding_fields = read_json(path), [each.name for each in fields(Finding)]
         if not isinstance(entries, list):
             raise ValueError("no list")
-        if not all(isinstance(entry, dict) and {*entry} == {*keys} for entry in entries):
-            raise ValueError(f"a finding has the keys {', '.join(keys)}")
+        if not all(isinstance(entry, dict) and {*entry} == {*finding_fields} for entry in entries):
+            raise ValueError(f"a finding has the keys {', '.join(finding_fields)}")
         return [asdict(Finding(**entry)) for entry in entries]
 
 

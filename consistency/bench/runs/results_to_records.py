@@ -47,15 +47,15 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
     """
     if filter_name not in results.filters:
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
-    broken = results.failures[results.failures["filter"] == filter_name]
+    failed_runs = results.failures[results.failures["filter"] == filter_name]
     convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
     steps = longest_run(results) if steps is None else steps
     shape = len(runs), steps
     pose, covariance = np.full((*shape, 3), np.nan), np.full((*shape, 3, 3), np.nan)
-    own = None if convention == ADDITIVE else covariance.copy()
+    own_covariance = None if convention == ADDITIVE else covariance.copy()
     nis, nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
     nees = np.full(shape, np.nan) if results.has_truth else None
-    own_nees = None if own is None or nees is None else nees.copy()
+    own_nees = None if own_covariance is None or nees is None else nees.copy()
     t = np.full(steps, np.nan)
     for batch in results.batches("estimates", results.numbers_of(filter_name), filter_name):
         if (batch["step"] < 1).any():
@@ -67,25 +67,26 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
         nis.reshape(-1)[at], nis_dof.reshape(-1)[at], t[batch["step"] - 1] = batch["nis"], batch["nis_dof"], batch["t"]
         if nees is not None:
             nees.reshape(-1)[at] = batch["nees"]
-        if own is not None:
+        if own_covariance is not None:
             _require_own(batch, filter_name)
-            _fill(own, at, batch, OWN_COVARIANCE)
+            _fill(own_covariance, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
             own_nees.reshape(-1)[at] = batch["own_nees"]
     failures = tuple(
-        Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False)
+        Failure(filter_name, int(run), int(step), one_line(reason, 2000))
+        for _, run, step, reason in failed_runs.itertuples(index=False)
     )
     dof = len(POSE) if results.has_truth else 0
-    parts = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
+    record_with = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
-    world = parts(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
+    world = record_with(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
     _require_agreement(world)
-    _require_all(world, "nees", covariance if own is None else own)
+    _require_all(world, "nees", covariance if own_covariance is None else own_covariance)
     record = world
-    if own is not None:
-        record = parts(own_error, own, own_nees, convention=convention, world=world)
+    if own_covariance is not None:
+        record = record_with(own_error, own_covariance, own_nees, convention=convention, world=world)
         _require_agreement(record)
-        _require_all(record, "own_nees", own)
+        _require_all(record, "own_nees", own_covariance)
     _require_nis(filter_name, runs, nis, nis_dof)
     return replace(
         record, nis=nis, nis_dof=nis_dof, failures=failures, t=t,
@@ -223,24 +224,34 @@ def map_of(
         judged = np.isfinite(rows["nees"])
         if not judged.any():
             return None
-        some: Any = slice(None) if judged.all() else judged  # a slice is not a copy
-        runs, row = np.unique(rows["run"][some], return_inverse=True)
-        labels, column = np.unique(rows["landmark"][some], return_inverse=True)
+        judged_rows: Any = slice(None) if judged.all() else judged  # a slice is not a copy
+        runs, row = np.unique(rows["run"][judged_rows], return_inverse=True)
+        labels, column = np.unique(rows["landmark"][judged_rows], return_inverse=True)
         nees = np.full((len(runs), len(labels)), np.nan)
-        nees[row, column] = rows["nees"][some]
+        nees[row, column] = rows["nees"][judged_rows]
         errors, covariances = np.full((*nees.shape, dof), np.nan), np.full((*nees.shape, dof, dof), np.nan)
-        errors[row, column] = error[some, :dof]
-        covariances[row, column] = covariance[some, :dof, :dof]
+        errors[row, column] = error[judged_rows, :dof]
+        covariances[row, column] = covariance[judged_rows, :dof, :dof]
         common = np.isfinite(nees).all(axis=0)
-        kept = common if common.any() else np.full(len(labels), True)
-        at: Any = slice(None) if kept.all() else kept
-        known = common.any() and bool(np.isfinite(errors[:, at]).all())
-        pose = None if last is None else last[np.searchsorted(of_poses, runs)]
+        landmarks_kept = common if common.any() else np.full(len(labels), True)
+        at: Any = slice(None) if landmarks_kept.all() else landmarks_kept
+        has_errors = common.any() and bool(np.isfinite(errors[:, at]).all())
+        joint_nees = None
+        if last is not None and joint is not None:
+            pose_nees = last[np.searchsorted(of_poses, runs)]
+            joint_nees = _joint(pose_nees, joint[judged_rows], dof, row, column, landmarks_kept)
         return Record(
-            filter_name, errors[:, at] if known else None, covariances[:, at] if known else None, nees[:, at], dof,
-            failures=failures, axes=POINT[:dof], runs=runs, landmarks=labels[kept],
-            joint=None if pose is None or joint is None else _joint(pose, joint[some], dof, row, column, kept),
-        )  # fmt: skip
+            filter_name,
+            errors[:, at] if has_errors else None,
+            covariances[:, at] if has_errors else None,
+            nees[:, at],
+            dof,
+            failures=failures,
+            axes=POINT[:dof],
+            runs=runs,
+            landmarks=labels[landmarks_kept],
+            joint=joint_nees,
+        )
 
     return MapRecord(rows["run"], rows["nees"], dof, record)
 
@@ -327,11 +338,11 @@ def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> Ni
     results = open_results(folder)
     name = choose(folder, "filter", results.filters, filter_name)
     run_number = choose(folder, "run", results.runs_of(name).tolist(), run)
-    parts = []
+    nis_parts = []
     for batch in results.batches("estimates", INNOVATIONS, name):
         rows = batch["run"] == run_number
-        parts.append(np.stack([batch[column][rows].astype(float) for column in INNOVATIONS[1:]]))
-    step, t, nis, dof = np.concatenate(parts, axis=1) if parts else np.empty((4, 0))
+        nis_parts.append(np.stack([batch[column][rows].astype(float) for column in INNOVATIONS[1:]]))
+    step, t, nis, dof = np.concatenate(nis_parts, axis=1) if nis_parts else np.empty((4, 0))
     if not len(step):
         raise InputError(f"{folder}: run {run_number} of '{name}' failed before its first estimate")
     order = np.argsort(step, kind="stable")

@@ -93,10 +93,10 @@ def _rounds(
 ) -> Iterator[range]:
     """Runs up to each look; says how it stands after those that were new."""
     is_new, runs = False, 0
-    for ahead in counts:
+    for runs_at_look in counts:
         if is_new:
             say(f"{runs} runs: {progress_text(decided, names)}")
-        runs, is_new = ahead, not campaign.gathered.finished.issuperset(range(ahead))
+        runs, is_new = runs_at_look, not campaign.gathered.finished.issuperset(range(runs_at_look))
         yield range(runs)
     if is_new:
         say(f"{runs} runs: {progress_text(decided, names)}")
@@ -107,10 +107,10 @@ def _rounds(
 
 def _require_less(campaign: Campaign, max_runs: int | None) -> None:
     """Refuse results to which no run can be added."""
-    done = campaign.gathered.finished
-    before = next(run for run in count() if run not in done)
-    if max_runs is not None and (before > max_runs or (before == max_runs and campaign.gathered.is_complete)):
-        raise InputError(f"the results to resume have {before} runs; the plan looks for the last time at {max_runs}")
+    finished_runs = campaign.gathered.finished
+    runs = next(run for run in count() if run not in finished_runs)
+    if max_runs is not None and (runs > max_runs or (runs == max_runs and campaign.gathered.is_complete)):
+        raise InputError(f"the results to resume have {runs} runs; the plan looks for the last time at {max_runs}")
 
 
 def plan_of(plan: dict[str, Any]) -> Design:

@@ -107,12 +107,12 @@ class Journal:
         """Keep a finished run: its columns by the names of the parts, and ``notes``, which JSON can hold."""
         with self._transaction() as database:
             for name, columns in parts.items():
-                types = json.dumps({column: values.dtype.str for column, values in columns.items()})
+                column_types = json.dumps({column: values.dtype.str for column, values in columns.items()})
                 numbers = b"".join([values.tobytes() for values in columns.values()])
-                row = (run, name, types, numbers, zlib.crc32(numbers))
-                database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", row)
-            noted = json.dumps(dict(notes)) if notes else None
-            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted))
+                part_row = (run, name, column_types, numbers, zlib.crc32(numbers))
+                database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", part_row)
+            noted_json = json.dumps(dict(notes)) if notes else None
+            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted_json))
         self._runs.add(run)
         if notes:
             self.notes[run] = dict(notes)
@@ -129,10 +129,10 @@ class Journal:
                 row = self._database.execute(query, (run, name)).fetchone()
             if row is None:
                 continue
-            types, numbers, checksum = row
+            column_types, numbers, checksum = row
             if zlib.crc32(numbers) != checksum:
                 raise self._damaged(f"run {run}")
-            yield run, _decode(numbers, json.loads(types))
+            yield run, _decode(numbers, json.loads(column_types))
 
     def close(self) -> None:
         with self._faults():

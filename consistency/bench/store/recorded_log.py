@@ -75,21 +75,22 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         return read_parquet(folder, name)
     if not is_file(path):
         raise InputError(f"{path}: is not a file")
-    names = _header(path)
-    needed = dict.fromkeys((*COLUMNS[name], *also))
-    if missing := [column for column in needed if column not in names]:
-        raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
-    if twice := [column for column in names if names.count(column) > 1]:
-        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
-    kinds = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in names}
+    column_names = _header(path)
+    needed_columns = dict.fromkeys((*COLUMNS[name], *also))
+    if missing_columns := [column for column in needed_columns if column not in column_names]:
+        raise InputError(f"{path}: column '{missing_columns[0]}' is missing; needed: {', '.join(needed_columns)}")
+    if repeated_columns := [column for column in column_names if column_names.count(column) > 1]:
+        raise InputError(f"{path}: column '{repeated_columns[0]}' is duplicated")
+    column_types = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in column_names}
     with reading(path, DAMAGED):
-        convert = pa_csv.ConvertOptions(include_columns=list(kinds), column_types=dict.fromkeys(kinds, pa.float64()))
-        read = pa_csv.read_csv(path, convert_options=convert)
-        require_room(path, read.nbytes)
-        table: pd.DataFrame = read.to_pandas()
-    for column, kind in kinds.items():
+        numbers = dict.fromkeys(column_types, pa.float64())
+        convert = pa_csv.ConvertOptions(include_columns=list(column_types), column_types=numbers)
+        csv_table = pa_csv.read_csv(path, convert_options=convert)
+        require_room(path, csv_table.nbytes)
+        table: pd.DataFrame = csv_table.to_pandas()
+    for column, kind in column_types.items():
         check_column(path, table[column], kind)
-    return table.astype(kinds)
+    return table.astype(column_types)
 
 
 def _header(path: Path) -> list[str]:
@@ -154,26 +155,24 @@ def read_log(folder: str | Path) -> Log:
         raise InputError(f"{path}: key 'motion': missing; give sigma_v and sigma_omega of the odometry")
     belief = Belief(motion=sensor.motion, sensor=sensor.belief(), sigma_points=sensor.sigma_points, guard=sensor.guard)
     controls, observations = read_table_file(folder, "controls"), _observations(folder, sensor)
-    tables = {
-        name: read_table_file(folder, name) if table_file(folder, name).exists() else None
-        for name in ("truth", "landmarks")
-    }
+    truth, landmarks = _optional_table(folder, "truth"), _optional_table(folder, "landmarks")
     _check(folder, controls, observations, belief)
     _check_pixels(folder, observations, sensor)
-    start = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
-    names = _names(folder, observations, tables["landmarks"])
-    positions = _positions(folder, tables["landmarks"], names, belief)
-    of_controls, of_observations, truth = _by_run(controls), _by_run(observations), tables["truth"]
+    start_pose = np.array([sensor.start.x, sensor.start.y, sensor.start.heading]) if sensor.start else None
+    names = _names(folder, observations, landmarks)
+    positions = _positions(folder, landmarks, names, belief)
+    of_controls, of_observations = _by_run(controls), _by_run(observations)
     of_truth = None if truth is None else _by_run(truth)
-    trials = [
-        _trial(folder, run, of_controls(run), of_observations(run), names, of_truth and of_truth(run), start, positions)
-        for run in sorted({int(run) for run in controls["run"]})
-    ]
-    texts = [file for file in folder.glob("*.csv") if file.stem in COLUMNS]
-    files = [path, *sorted([*folder.glob("*.parquet"), *texts])]
+    trials = []
+    for run in sorted({int(run) for run in controls["run"]}):
+        path_of_run = None if of_truth is None else of_truth(run)
+        rows = of_controls(run), of_observations(run)
+        trials.append(_trial(folder, run, *rows, names, path_of_run, start_pose, positions))
+    csv_files = [file for file in folder.glob("*.csv") if file.stem in COLUMNS]
+    files = [path, *sorted([*folder.glob("*.parquet"), *csv_files])]
     with reading(folder):
         digests = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    return Log(str(folder), trials, belief, tables["landmarks"], digests)
+    return Log(str(folder), trials, belief, landmarks, digests)
 
 
 def write_log(
@@ -243,6 +242,10 @@ def _sensor_file(belief: Belief, start: Array, view: View | None) -> str:
     if belief.guard is not None:
         keys["guard"] = belief.guard.model_dump(exclude_none=True)
     return toml_text(keys)
+
+
+def _optional_table(folder: Path, name: str) -> pd.DataFrame | None:
+    return read_table_file(folder, name) if table_file(folder, name).exists() else None
 
 
 def _observations(folder: Path, sensor: SensorFile) -> pd.DataFrame:

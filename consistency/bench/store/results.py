@@ -91,9 +91,9 @@ class Tables(ABC):
 
     def _repr_html_(self) -> str:
         """Summary of the results for a notebook; ``consistency.analyse`` judges them."""
-        world = self.manifest.get("scenario") or {}
-        title = f"Results of {world.get('name') or self.manifest.get('log') or 'runs'}"
-        rows = "".join(
+        scenario_entry = self.manifest.get("scenario") or {}
+        title = f"Results of {scenario_entry.get('name') or self.manifest.get('log') or 'runs'}"
+        table_rows = "".join(
             f"<tr><th style='text-align:left'>{escape(name)}</th><td>{len(self.runs_of(name))}</td>"
             f"<td>{int((self.failures['filter'] == name).sum())}</td></tr>"
             for name in self.filters
@@ -101,7 +101,7 @@ class Tables(ABC):
         truth = "with truth" if self.has_truth else "without truth"
         return (
             f"<div><p><strong>{escape(str(title))}</strong>, {truth}, seed {escape(str(self.manifest.get('seed')))}</p>"
-            f"<table><tr><th>filter</th><th>runs</th><th>failed</th></tr>{rows}</table></div>"
+            f"<table><tr><th>filter</th><th>runs</th><th>failed</th></tr>{table_rows}</table></div>"
         )
 
     def finished_runs(self, filters: Sequence[str]) -> set[int]:
@@ -219,12 +219,12 @@ def open_results(folder: str | Path) -> StoredResults:
     folder = Path(folder)
     manifest = read_manifest(folder)
     require_manifest(folder, manifest)
-    written = manifest["tables"]
-    for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
+    tables_written = manifest["tables"]
+    for name in ("estimates", *(name for name in ("truth", "map") if name in tables_written)):
         require_table(folder, name)
     require_unchanged(folder, manifest)
-    landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
-    rejections = read_parquet(folder, "rejections") if "rejections" in written else None
+    landmarks = read_parquet(folder, "landmarks") if "landmarks" in tables_written else None
+    rejections = read_parquet(folder, "rejections") if "rejections" in tables_written else None
     results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)
     if OWN_NUMBERS in map(results.numbers_of, results.filters):
         require_table(folder, "estimates", OWN_NUMBERS)

@@ -101,21 +101,22 @@ def require_rows(
     filters: list[str] = manifest["filters"]
     if scenario is not None and manifest.get("scenario_hash") != scenario.hash:
         raise InputError(f"{folder / 'manifest.json'}: key 'scenario_hash' is not that of key 'scenario'; {AGAIN}")
-    failed = _failed(folder / "failures.parquet", filters, failures, manifest["failures"])
-    there = {name: _steps(folder, "estimates", 1, name) for name in filters}
-    _require_all_rows(folder, "estimates", sum(sum(steps.values()) for steps in there.values()))
-    truth = None
+    failed_steps = _failed(folder / "failures.parquet", filters, failures, manifest["failures"])
+    steps_of_filters = {name: _steps(folder, "estimates", 1, name) for name in filters}
+    _require_all_rows(folder, "estimates", sum(sum(steps.values()) for steps in steps_of_filters.values()))
+    true_steps = None
     if "truth" in manifest["tables"]:
-        truth = {run: rows - 1 for run, rows in _steps(folder, "truth", 0).items()}
-        _require_all_rows(folder, "truth", sum(truth.values()) + len(truth))
-    length = _lengths(folder, scenario, truth, there)
-    _require_runs(folder / "manifest.json", manifest, scenario, length | dict.fromkeys(_union(failed), 0))
+        true_steps = {run: rows - 1 for run, rows in _steps(folder, "truth", 0).items()}
+        _require_all_rows(folder, "truth", sum(true_steps.values()) + len(true_steps))
+    run_lengths = _lengths(folder, scenario, true_steps, steps_of_filters)
+    _require_runs(folder / "manifest.json", manifest, scenario, run_lengths | dict.fromkeys(_union(failed_steps), 0))
     for name in filters:
-        _require_filter(folder / "estimates.parquet", name, there[name], failed[name], length, truth is not None)
+        estimated, failed = steps_of_filters[name], failed_steps[name]
+        _require_filter(folder / "estimates.parquet", name, estimated, failed, run_lengths, true_steps is not None)
     if "map" in manifest["tables"]:
-        _require_maps(folder, there, failed)
+        _require_maps(folder, steps_of_filters, failed_steps)
     if rejections is not None:
-        _require_rejections(folder / "rejections.parquet", rejections, there, failed)
+        _require_rejections(folder / "rejections.parquet", rejections, steps_of_filters, failed_steps)
     if landmarks is not None and landmarks["landmark"].duplicated().any():
         raise InputError(f"{folder / 'landmarks.parquet'}: column 'landmark': a landmark is duplicated; {AGAIN}")
 
@@ -124,16 +125,16 @@ def _failed(path: Path, filters: Sequence[str], failures: pd.DataFrame, count: i
     """Step of the failure of each run, by filter."""
     if len(failures) != count:
         raise InputError(f"{path}: has {len(failures)} rows, manifest.json counts {count} failures; {AGAIN}")
-    failed: dict[str, Steps] = {name: {} for name in filters}
+    failed_steps: dict[str, Steps] = {name: {} for name in filters}
     for name, run, step in zip(failures["filter"], failures["run"], failures["step"], strict=True):
-        if name not in failed:
+        if name not in failed_steps:
             raise InputError(f"{path}: '{one_line(name)}' is not a filter of these results; {AGAIN}")
-        if run in failed[name] or run < 0 or step < 1:
+        if run in failed_steps[name] or run < 0 or step < 1:
             raise InputError(
                 f"{path}: run {run} of '{name}', step {step}: a run fails once, in step 1 or later; {AGAIN}"
             )
-        failed[name][int(run)] = int(step)
-    return failed
+        failed_steps[name][int(run)] = int(step)
+    return failed_steps
 
 
 def _steps(folder: Path, table: str, begin: int, filter_name: str | None = None) -> Steps:
@@ -179,24 +180,24 @@ def _lengths(folder: Path, scenario: Scenario | None, truth: Steps | None, there
 
 
 def _require_runs(path: Path, manifest: dict[str, Any], scenario: Scenario | None, runs: Steps) -> None:
-    count = manifest["runs"] if manifest["complete"] else manifest["finished_runs"]
-    if len(runs) != count:
-        raise InputError(f"{path}: counts {count} runs, the tables hold {len(runs)}; {AGAIN}")
+    runs_of_manifest = manifest["runs"] if manifest["complete"] else manifest["finished_runs"]
+    if len(runs) != runs_of_manifest:
+        raise InputError(f"{path}: counts {runs_of_manifest} runs, the tables hold {len(runs)}; {AGAIN}")
     if scenario is not None and runs and max(runs) >= manifest["runs"]:
         raise InputError(f"{path}: key 'runs' is {manifest['runs']}, the tables hold run {max(runs)}; {AGAIN}")
 
 
 def _require_filter(path: Path, name: str, there: Steps, failed: Steps, length: Steps, known: bool) -> None:
     """Every run is there: whole, or up to the step before its failure. ``known``: the length of failed ones, too."""
-    if missing := sorted(set(length) - set(there) - set(failed)):
-        raise InputError(f"{path}: run {missing[0]} of '{name}' is missing; {AGAIN}")
+    if missing_runs := sorted(set(length) - set(there) - set(failed)):
+        raise InputError(f"{path}: run {missing_runs[0]} of '{name}' is missing; {AGAIN}")
     for run in sorted({*there, *failed}):
-        steps, whole = there.get(run, 0), length.get(run)
-        if (known and whole is None) or (run in failed and known and failed[run] > (whole or 0)):
+        steps, run_length = there.get(run, 0), length.get(run)
+        if (known and run_length is None) or (run in failed and known and failed[run] > (run_length or 0)):
             raise InputError(f"{path}: run {run} of '{name}' has steps that truth.parquet lacks; {AGAIN}")
-        expected = failed[run] - 1 if run in failed else whole
-        if steps != expected:
-            raise InputError(f"{path}: run {run} of '{name}' has {steps} steps, not {expected}; {AGAIN}")
+        expected_steps = failed[run] - 1 if run in failed else run_length
+        if steps != expected_steps:
+            raise InputError(f"{path}: run {run} of '{name}' has {steps} steps, not {expected_steps}; {AGAIN}")
 
 
 def _require_maps(folder: Path, there: dict[str, Steps], failed: dict[str, Steps]) -> None:

@@ -43,15 +43,15 @@ def stacked_table(name: str, parts: Sequence[tuple[str, Columns]], also: Sequenc
     if parts:
         rows, stacked = [len(columns["run"]) for _, columns in parts], dict[str, Any]()
         if name in BY_FILTER:
-            names = pd.Series([each for each, _ in parts], dtype="str")
-            stacked["filter"] = names.repeat(rows).reset_index(drop=True)
+            filter_names = pd.Series([filter_name for filter_name, _ in parts], dtype="str")
+            stacked["filter"] = filter_names.repeat(rows).reset_index(drop=True)
         for column in dict.fromkeys(column for _, part in parts for column in part):
             pairs = zip(parts, rows, strict=True)
-            pieces = [part[column] if column in part else np.full(n, np.nan) for (_, part), n in pairs]
-            stacked[column] = np.concatenate(pieces)
+            column_pieces = [part[column] if column in part else np.full(n, np.nan) for (_, part), n in pairs]
+            stacked[column] = np.concatenate(column_pieces)
         table = pd.DataFrame(stacked, copy=False)
-    missing = [column for column in also if column not in table]
-    return table.assign(**dict.fromkeys(missing, np.nan)) if missing else table
+    missing_columns = [column for column in also if column not in table]
+    return table.assign(**dict.fromkeys(missing_columns, np.nan)) if missing_columns else table
 
 
 def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
@@ -77,7 +77,7 @@ def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
 
 def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
     """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
-    labelled = any(t.source is not None for t in trials)
+    has_sources = any(t.source is not None for t in trials)
     return pd.concat(
         [
             pd.DataFrame(
@@ -86,7 +86,7 @@ def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
                     "step": t.step,
                     "landmark": t.landmark,
                     **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
-                    **({"source": t.landmark if t.source is None else t.source} if labelled else {}),
+                    **({"source": t.landmark if t.source is None else t.source} if has_sources else {}),
                 }
             )
             for t in trials

@@ -100,12 +100,12 @@ def write_regime(regime: Regime, out: Path) -> list[Path]:
 def dumped(regime: Regime) -> str:
     """The map as JSON, a row a line."""
     manifest = dict(regime.manifest) | {"sweep": describe(regime.sweep), "columns": ["cell", "filter", *FIELDS]}
-    rows = []
+    result_rows = []
     for number, name in sorted(regime.results):
         numbers = plain_numbers(regime.results[number, name])
-        rows.append(json.dumps([number, name, *numbers.values()], ensure_ascii=False))
-    head = json.dumps(manifest, indent=1, ensure_ascii=False).removesuffix("\n}")
-    return f'{head},\n "rows": [\n  ' + ",\n  ".join(rows) + "\n ]\n}\n"
+        result_rows.append(json.dumps([number, name, *numbers.values()], ensure_ascii=False))
+    manifest_json = json.dumps(manifest, indent=1, ensure_ascii=False).removesuffix("\n}")
+    return f'{manifest_json},\n "rows": [\n  ' + ",\n  ".join(result_rows) + "\n ]\n}\n"
 
 
 def _shipped_map() -> Path:

@@ -128,15 +128,15 @@ def runs_table(record: Record) -> pd.DataFrame:
     error, runs = record.in_world.error, record.run_numbers
     assert error is not None
     assert record.nees is not None
-    square = np.where(np.isfinite(record.nees)[..., None], error**2, np.nan)
+    squared_errors = np.where(np.isfinite(record.nees)[..., None], error**2, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mean of empty slice")  # a run without an estimate
-        mean = np.nanmean(square, axis=1)
+        mean_squares = np.nanmean(squared_errors, axis=1)
     failed = {failure.run: failure for failure in record.failures}
-    steps = [failed[run].step if run in failed else None for run in runs]
+    failed_steps = [failed[run].step if run in failed else None for run in runs]
     reasons = [failed[run].reason if run in failed else None for run in runs]
-    position, heading = np.sqrt(mean[:, 0] + mean[:, 1]), np.sqrt(mean[:, 2])
-    columns = (runs, mean_nees_of_runs(record), position, heading, pd.array(steps, "Int64"), reasons)
+    position, heading = np.sqrt(mean_squares[:, 0] + mean_squares[:, 1]), np.sqrt(mean_squares[:, 2])
+    columns = (runs, mean_nees_of_runs(record), position, heading, pd.array(failed_steps, "Int64"), reasons)
     return pd.DataFrame(dict(zip(RUN_COLUMNS, columns, strict=True)))
 
 
@@ -160,20 +160,21 @@ def cost_of(filter_name: str, reference: str, scenario: Scenario, seed: int) -> 
 def _fastest(filters: list[Filter], trial: Trial, scenario: Scenario) -> list[float]:
     """Seconds that each filter takes at best; infinite where it fails, which is tried where it can do no harm."""
     belief = scenario.belief
-    if apart := [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]:
-        with Isolation(apart, belief, PATIENCE) as isolation:
+    if not_compiled := [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]:
+        with Isolation(not_compiled, belief, PATIENCE) as isolation:
             if any(estimates.failure for estimates in isolation.run(trial)):
                 return [np.inf] * len(filters)
     compile_all((filter_, trial, belief) for filter_ in filters)
-    best = [np.inf] * len(filters)
+    fastest_seconds = [np.inf] * len(filters)
     # a thread of its own, in which a kernel runs, too: from the main thread it would run in another one
     with one_blas_thread(), ThreadPoolExecutor(1) as thread:
         for _ in range(TIMED):
             for i, filter_ in enumerate(filters):
-                best[i] = min(best[i], thread.submit(_cpu_time, filter_, trial, scenario).result())
-            if sum(best) > SLOW:
+                seconds = thread.submit(_cpu_time, filter_, trial, scenario).result()
+                fastest_seconds[i] = min(fastest_seconds[i], seconds)
+            if sum(fastest_seconds) > SLOW:
                 break
-    return best
+    return fastest_seconds
 
 
 def _cpu_time(filter_: Filter, trial: Trial, scenario: Scenario) -> float:
@@ -202,13 +203,13 @@ def result_from(numbers: Mapping[str, Any]) -> CellResult:
     """The result that :func:`plain_numbers` gave; raises ValueError where a field is missing, unknown or no number."""
     if not isinstance(numbers, Mapping) or set(numbers) != {f.name for f in fields(CellResult)}:
         raise ValueError("the fields are not those of a cell's result")
-    given = dict(numbers)
+    result_fields = dict(numbers)
     for name in NUMBERS:
-        value = given[name]
+        value = result_fields[name]
         if value is None:
-            given[name] = np.nan
+            result_fields[name] = np.nan
         elif isinstance(value, (int, float, str)):
-            given[name] = float(value)
+            result_fields[name] = float(value)
         else:
             raise ValueError(f"'{name}' is not a number")
-    return CellResult(**given)
+    return CellResult(**result_fields)

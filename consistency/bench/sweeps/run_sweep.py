@@ -61,7 +61,7 @@ def _in_turn(folder: SweepFolder, todo: list[CellWork], how: dict[str, Any]) -> 
     """Do each, and yield it when it is there; what another process is at work on is tried again after the others."""
     is_told = False
     while todo:
-        busy = []
+        busy_cells = []
         for work in todo:
             try:
                 with _system_refusals(folder), folder.at_work(work) as journal:
@@ -70,15 +70,15 @@ def _in_turn(folder: SweepFolder, todo: list[CellWork], how: dict[str, Any]) -> 
                         outcome = run_cell(folder.sweep, work.cell, work.filter, journal=journal, **how)
                         folder.write(work, outcome, time.monotonic() - begun)
             except Busy:
-                busy.append(work)
+                busy_cells.append(work)
             else:
                 yield work
-        if len(busy) == len(todo):
+        if len(busy_cells) == len(todo):
             if not is_told:
-                say(f"waiting for another process, which is at work on the last {len(busy)}")
+                say(f"waiting for another process, which is at work on the last {len(busy_cells)}")
             is_told = True
             time.sleep(PAUSE)
-        todo = busy
+        todo = busy_cells
 
 
 @contextmanager

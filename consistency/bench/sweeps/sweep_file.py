@@ -136,9 +136,9 @@ def number_of_points(axes: Sequence[Axis]) -> int:
 
 def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
     """A cell's values on some axes, and in a sweep with axes that vary alone what of the cell does."""
-    places = [cell.indices[sweep.axes.index(axis)] for axis in (*axes, *sweep.alone)]
-    alone = [text_of(sweep.alone, places[len(axes) :])] if sweep.alone else []
-    return [*map(Axis.say, axes, places), *alone]
+    axis_places = [cell.indices[sweep.axes.index(axis)] for axis in (*axes, *sweep.alone)]
+    alone_text = [text_of(sweep.alone, axis_places[len(axes) :])] if sweep.alone else []
+    return [*map(Axis.say, axes, axis_places), *alone_text]
 
 
 def _changed(axes: Sequence[Axis], at: Sequence[int]) -> list[tuple[Axis, int]]:
@@ -290,7 +290,7 @@ def _require_cells(sweep: Sweep) -> None:
 
 def _keys_of(axis: Axis, base: Scenario) -> list[str]:
     """Keys of the scenario that an axis sets; each of its values is tried in the base."""
-    keys: list[str] = []
+    scenario_keys: list[str] = []
     for value in axis.values:
         try:
             changes = axis.changes(base, value)
@@ -298,5 +298,5 @@ def _keys_of(axis: Axis, base: Scenario) -> list[str]:
         except ValueError as error:
             text = explain(error, Scenario)
             raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
-        keys = list(changes)
-    return keys
+        scenario_keys = list(changes)
+    return scenario_keys

@@ -129,8 +129,8 @@ class SweepFolder:
 
         Slow cells lie together in the grid; mixed, the time left is foreseen.
         """
-        mixed = sorted(self.sweep.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
-        return [CellWork(cell, name) for cell in mixed for name in self.sweep.filters]
+        cells_in_mixed_order = sorted(self.sweep.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
+        return [CellWork(cell, name) for cell in cells_in_mixed_order for name in self.sweep.filters]
 
     def begin(self) -> None:
         """Make the folder, or take over the one that is there; other processes may do so at the same time."""
@@ -195,13 +195,13 @@ class SweepFolder:
 
 def describe(sweep: Sweep) -> dict[str, Any]:
     """A sweep as JSON, from which it can be made again."""
-    varied = {axis.key: list(axis.values) for axis in sweep.alone}
+    values_alone = {axis.key: list(axis.values) for axis in sweep.alone}
     return {
         "name": sweep.name,
         "summary": sweep.summary,
         "base": sweep.base.model_dump(mode="json"),
         "grid": {axis.key: list(axis.values) for axis in sweep.grid},
-        **({"alone": varied} if varied else {}),
+        **({"alone": values_alone} if values_alone else {}),
         "filters": list(sweep.filters),
         "seed": sweep.seed,
         "rule": sweep.rule.model_dump(),

@@ -51,39 +51,40 @@ def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
 
 def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     require_counts(runs, seed)
-    for_fit, for_verdict = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
-    simulated = Simulated(scenario, for_fit)
+    fit_seed, verdict_seed = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
+    simulated = Simulated(scenario, fit_seed)
     trials = [simulated(run) for run in range(runs)]
 
     def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
-        return run_trials(with_belief(scenario, belief), [filter_], runs, for_verdict, jobs, timeout)
+        return run_trials(with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
 
-    count = _runs(runs)
-    fresh = f"{count} that the fit has not seen"
-    return Parts(scenario, trials, on_fresh, count, fresh, f"--runs {runs} --seed {for_verdict}")
+    runs_text = _runs(runs)
+    judged_on = f"{runs_text} that the fit has not seen"
+    return Parts(scenario, trials, on_fresh, runs_text, judged_on, f"--runs {runs} --seed {verdict_seed}")
 
 
 def _parts_of_log(log: Log) -> Parts:
     trials = log.trials
     if len(trials) > 1:
-        half = (len(trials) + 1) // 2
-        first, second = trials[:half], trials[half:]
-        fitted_on, judged_on = f"the first {_runs(half)}", f"the other {len(second)}"
+        fitted_runs = (len(trials) + 1) // 2
+        fit_trials, verdict_trials = trials[:fitted_runs], trials[fitted_runs:]
+        fitted_on, judged_on = f"the first {_runs(fitted_runs)}", f"the other {len(verdict_trials)}"
     else:
-        [only] = trials
+        [only_trial] = trials
         if log.belief.sensor.model == "linear":
             raise InputError(f"--log {log.name}: one run of a linear world cannot be divided; give two or more")
-        middle = only.steps // 2
-        if middle < 1:
+        middle_step = only_trial.steps // 2
+        if middle_step < 1:
             raise InputError(f"--log {log.name}: one run of one step cannot be divided; give a longer one")
-        first, second = [part_of(only, 0, middle)], [part_of(only, middle, only.steps)]
-        fitted_on = f"the first {middle} steps"
-        judged_on = f"the other {only.steps - middle}, which begin with an empty map"
+        fit_trials = [part_of(only_trial, 0, middle_step)]
+        verdict_trials = [part_of(only_trial, middle_step, only_trial.steps)]
+        fitted_on = f"the first {middle_step} steps"
+        judged_on = f"the other {only_trial.steps - middle_step}, which begin with an empty map"
 
     def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
-        return run_log(replace(log, trials=second, belief=belief), [filter_], jobs, timeout)
+        return run_log(replace(log, trials=verdict_trials, belief=belief), [filter_], jobs, timeout)
 
-    return Parts(log, first, on_fresh, fitted_on, judged_on, "")
+    return Parts(log, fit_trials, on_fresh, fitted_on, judged_on, "")
 
 
 def _runs(count: int) -> str:

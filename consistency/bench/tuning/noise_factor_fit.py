@@ -115,14 +115,14 @@ def derivatives(scores: KnownScores, x: Array, free: Sequence[int] | Array) -> t
     def total(at: Array) -> float:
         return float(scores(at).sum())
 
-    here, slope, curvature = total(x), np.zeros(len(x)), np.zeros((len(x), len(x)))
+    at_point, slope, curvature = total(x), np.zeros(len(x)), np.zeros((len(x), len(x)))
     for i in free:
         ahead, behind = total(x + step[i]), total(x - step[i])
         slope[i] = (ahead - behind) / (2.0 * STEP)
-        curvature[i, i] = (ahead - 2.0 * here + behind) / STEP**2
+        curvature[i, i] = (ahead - 2.0 * at_point + behind) / STEP**2
     for i, j in combinations(free, 2):
         ahead, behind = total(x + step[i] + step[j]), total(x - step[i] - step[j])
-        along_both = (ahead - 2.0 * here + behind) / STEP**2
+        along_both = (ahead - 2.0 * at_point + behind) / STEP**2
         curvature[i, j] = (along_both - curvature[i, i] - curvature[j, j]) / 2.0
         curvature[j, i] = curvature[i, j]
     return slope, curvature

@@ -91,7 +91,7 @@ class Tuning:
 def tuning_lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     """What to print beside the table of verdicts; ``out`` is the folder that was written."""
     parts, chosen = tuning.parts, tuning.chosen
-    text = [
+    lines = [
         f"{tuning.filter} on {parts.world.name}: fitted by the likelihood of the innovations on {parts.fitted_on}, "
         f"judged on {parts.judged_on} ({chosen.settings} settings, {tuning.seconds:.0f} s)",
         *_factor_lines(chosen, parts.belief),
@@ -101,22 +101,22 @@ def tuning_lines(tuning: Tuning, out: Path | None = None) -> list[str]:
     if tuning.has_fault:
         names = ", ".join(factor.group.name for factor in chosen.factors)
         chance = f"one of {1.0 / chosen.verdict.settings.false_alarm:.3g} verdicts on a right filter"
-        text.append(
+        lines.append(
             f"the size of {names} is not all that is wrong, unless the fault was found by chance, as in {chance}; "
             "docs/tuning.md says what else may be"
         )
-    text += ["", noise_table(tuning).rstrip()]
+    lines += ["", noise_table(tuning).rstrip()]
     if out is not None:
-        text += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
-    return text
+        lines += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
+    return lines
 
 
 def _factor_lines(setting: Setting, before: Belief) -> list[str]:
-    old, new = sigma_by_channel(before), sigma_by_channel(setting.belief)
+    sigma_before, sigma_after = sigma_by_channel(before), sigma_by_channel(setting.belief)
     rows = []
     for factor in setting.factors:
-        changed = ", ".join(f"{name} {old[name]:.4g} -> {new[name]:.4g}" for name in factor.group.channels)
-        rows.append(f"  {factor.group.name} {factor_text(factor)} (sigma: {changed})")
+        changes = [f"{name} {sigma_before[name]:.4g} -> {sigma_after[name]:.4g}" for name in factor.group.channels]
+        rows.append(f"  {factor.group.name} {factor_text(factor)} (sigma: {', '.join(changes)})")
     return rows
 
 

@@ -145,9 +145,9 @@ def places(report: Report) -> list[Place]:
     ]
 
 
-def window_of(found: list[Place], factor: float) -> tuple[float, float]:
+def window_of(intervals: list[Place], factor: float) -> tuple[float, float]:
     """Drawn range of the ratios; ends of intervals are not reason for a wider one."""
-    values = [1.0 / factor, factor, *(place.ratio.value for place in found)]
+    values = [1.0 / factor, factor, *(place.ratio.value for place in intervals)]
     return min(values) / ROOM, max(values) * ROOM
 
 

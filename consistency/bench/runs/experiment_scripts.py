@@ -72,7 +72,7 @@ def _executed(path: Path, name: str) -> ModuleType:
     return module
 
 
-def summary_of(module: ModuleType) -> str:
+def first_line_of(module: ModuleType) -> str:
     return (module.__doc__ or "").strip().splitlines()[0]
 
 

@@ -17,7 +17,7 @@ from joblib.externals.loky.backend import get_context
 
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.experiment_scripts import experiments, load_script, summary_of
+from consistency.bench.runs.experiment_scripts import experiments, first_line_of, load_script
 from consistency.bench.runs.missing_kernels import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
@@ -202,7 +202,7 @@ def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[st
             futures[module] = pool.submit(_contribution, module.__file__, study.runs, study.seed, study.jobs)
         ordered = sorted(selection, key=lambda pair: pair[0] in futures)  # processes are waited for last
         for number, (module, ids) in enumerate(ordered, start=1):
-            say(f"[{number} of {len(ordered)}] {Path(str(module.__file__)).stem}: {summary_of(module)}")
+            say(f"[{number} of {len(ordered)}] {Path(str(module.__file__)).stem}: {first_line_of(module)}")
             by_script[module] = _guarded(main, module, study, ids)
     finally:
         if pool is not None:
@@ -242,7 +242,7 @@ def _guarded(
     except InputError:
         raise
     except Exception as error:
-        claim = summary_of(module)
+        claim = first_line_of(module)
         unsaid = dict.fromkeys(("source", "statistic", "published", "accept"), "the experiment broke before it said")
         measured = f"{type(error).__name__}: {error}"
         return [study.finding(False, "none", id=name, claim=claim, measured=measured, **unsaid) for name in ids]

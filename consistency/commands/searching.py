@@ -186,7 +186,7 @@ def challenge_command(
         Plan,
         challenge_data,
         challenge_lines,
-        require_writable,
+        require_scenario_file,
         write_scenario,
     )
     from consistency.bench.challenging.challenge import challenge as challenge_filter
@@ -196,7 +196,7 @@ def challenge_command(
         minutes = 5.0
     plan = Plan(minutes, trials, seed, jobs, false_alarm, detect)
     out = Path(f"challenge-{filter_name}.toml") if out is None else out
-    require_writable(out, overwrite)
+    require_scenario_file(out, overwrite)
     outcome = challenge_filter(filter_name, scenario, plan, within or [])
     if outcome.found:
         write_scenario(outcome, out)

@@ -14,7 +14,15 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.pages.sections.published_findings import Exhibit, Source, groups, listing, several, shown, single
+from consistency.bench.pages.sections.published_findings import (
+    Exhibit,
+    Source,
+    exhibit_blocks,
+    groups,
+    listing,
+    several,
+    single,
+)
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, Look, style
@@ -281,4 +289,4 @@ EXHIBITS = (
 
 def blocks(report: Report) -> tuple[Block, ...]:
     """The exhibits whose tables the folder holds."""
-    return shown(report, EXHIBITS)
+    return exhibit_blocks(report, EXHIBITS)

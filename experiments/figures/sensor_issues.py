@@ -16,10 +16,10 @@ from consistency.bench.pages.sections.published_findings import (
     STATUS,
     Exhibit,
     Source,
+    exhibit_blocks,
     groups,
     listing,
     several,
-    shown,
     single,
 )
 from consistency.bench.pages.sections.report_input import Report
@@ -272,4 +272,4 @@ EXHIBITS = (
 
 def blocks(report: Report) -> tuple[Block, ...]:
     """The exhibits whose tables the folder holds."""
-    return shown(report, EXHIBITS)
+    return exhibit_blocks(report, EXHIBITS)

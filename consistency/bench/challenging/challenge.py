@@ -330,7 +330,7 @@ def challenge_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     }
 
 
-def require_writable(out: Path, overwrite: bool) -> None:
+def require_scenario_file(out: Path, overwrite: bool) -> None:
     """Refuse a file that cannot be written, before the search.
 
     Raises

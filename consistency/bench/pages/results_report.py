@@ -28,7 +28,7 @@ from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural
 from consistency.referee.document.blocks import Chapter, Document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.judged_estimators import clock_of
+from consistency.referee.pages.judged_estimators import time_axis_of
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance
 
@@ -92,7 +92,7 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
         summary=scenario.summary if scenario else "Recorded log",
         runs=len(runs),
         shown_run=shown_run,
-        clock=clock_of(tracks[0].shown.t if tracks else np.full(steps, np.nan)),
+        clock=time_axis_of(tracks[0].shown.t if tracks else np.full(steps, np.nan)),
         steps=np.arange(1, steps + 1),
         tracks=tracks,
         results=results,

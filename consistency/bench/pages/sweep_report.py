@@ -78,7 +78,7 @@ View = tuple[list[GridAxis], list[tuple[GridAxis, int]]]  # axes for the sides o
 
 def compose_regime(regime: Regime) -> Document:
     sweep = regime.sweep
-    about = Text(method(regime), style="note")
+    about = Text(how_cells_are_judged(regime), style="note")
     heat = tuple(heat_figure(regime, name) for name in sweep.filters)
     chapters = [
         Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary),
@@ -87,7 +87,7 @@ def compose_regime(regime: Regime) -> Document:
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
         Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
     ]
-    return Document(f"Regime map: {sweep.name}", answer(regime), tuple(chapters))
+    return Document(f"Regime map: {sweep.name}", consistent_cells_sentence(regime), tuple(chapters))
 
 
 def _regions(regime: Regime) -> list[Chapter]:
@@ -98,7 +98,7 @@ def _regions(regime: Regime) -> list[Chapter]:
     return [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
 
 
-def answer(regime: Regime) -> str:
+def consistent_cells_sentence(regime: Regime) -> str:
     """Which filter is consistent in how many cells, in one paragraph."""
     cells = regime.sweep.cells
     consistent_cells = {
@@ -114,7 +114,7 @@ def answer(regime: Regime) -> str:
     return text
 
 
-def method(regime: Regime) -> str:
+def how_cells_are_judged(regime: Regime) -> str:
     rule, wrong = regime.sweep.rule, "a ratio of true to stated covariance of"
     return (
         f"Each filter runs in each cell until it is decided, with at most {rule.max_runs} runs. A filter that is right "
@@ -318,12 +318,12 @@ def _draw_tiles(
     count = len(across.values)
     axes.grid(visible=False)
     axes.set(title=wrapped(title_of(at), 46), xlabel=_short(across.key), xlim=(-0.5, count - 0.5), xticks=range(count))
-    axes.set_xticklabels([wrapped(said(across, i), 12) for i in range(count)])
+    axes.set_xticklabels([wrapped(value_in_few_characters(across, i), 12) for i in range(count)])
     axes.set(ylim=(-0.5, 0.5), yticks=[])
     if len(sides) > 1:
         rows = len(sides[1].values)
         axes.set(ylabel=_short(sides[1].key), ylim=(-0.5, rows - 0.5), yticks=range(rows))
-        axes.set_yticklabels([wrapped(said(sides[1], i), 16) for i in range(rows)])
+        axes.set_yticklabels([wrapped(value_in_few_characters(sides[1], i), 16) for i in range(rows)])
     cell_results = results_at(regime, name, at)
     if not cell_results:
         say(axes, "no cell is there yet")
@@ -355,7 +355,7 @@ def words_of(result: CellResult) -> str:
     return f"{result.status}, covariance ratio {brief(result.ratio)} {ends}, {result.runs} runs"
 
 
-def said(axis: GridAxis, index: int) -> str:
+def value_in_few_characters(axis: GridAxis, index: int) -> str:
     """A value in few characters; by its number where it is long."""
     text = axis.say(index)
     return text if len(text) <= LONGEST else f"({index + 1}) {text[: LONGEST - 5]}…"

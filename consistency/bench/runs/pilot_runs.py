@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.results_to_records import records_of
+from consistency.bench.runs.results_to_records import records_of_results
 from consistency.bench.runs.scores_by_run import mean_nees_of_runs
 from consistency.bench.scenario import load_scenario
 from consistency.bench.store.results import Tables, open_results
@@ -31,7 +31,7 @@ def pilots_in_world(scenario: str, filters: Sequence[str], runs: int, seed: int)
 
 def pilots_of(results: Tables, filters: Sequence[str] | None = None) -> dict[str, tuple[Array, int]]:
     """Pilots of :func:`consistency.referee.verdicts.planned_runs.plan`, of every filter or of those named."""
-    return {of.name: (_pilot_means(of), of.t.size) for of in records_of(results, filters)}
+    return {of.name: (_pilot_means(of), of.t.size) for of in records_of_results(results, filters)}
 
 
 def _pilot_means(of: Record) -> Array:

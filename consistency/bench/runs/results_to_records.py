@@ -31,7 +31,7 @@ INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
 POINT = ("x", "y", "z")
 
 
-def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
+def records_of_results(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
     """A record for every filter of the results, or for those named, each read when it is asked for."""
     steps = longest_run(results)
     return (record_of(results, name, steps) for name in filters or results.filters)

@@ -58,7 +58,7 @@ class SweepFile(Table):
 
 @dataclass(frozen=True)
 class Cell:
-    number: int  # 0, 1, ... in the order of :func:`points`
+    number: int  # 0, 1, ... in the order of :func:`grid_points`
     indices: tuple[int, ...]  # place on each axis
     name: str  # of its folder
     text: str  # "baseline 0.09 m, range 4 m"
@@ -92,8 +92,8 @@ class Sweep:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Every cell, in the order of :func:`points`; raises ValueError where a scenario is refused."""
-        return tuple(self._cell(number, at) for number, at in enumerate(points(self.axes)))
+        """Every cell, in the order of :func:`grid_points`; raises ValueError where a scenario is refused."""
+        return tuple(self._cell(number, at) for number, at in enumerate(grid_points(self.axes)))
 
     def _cell(self, number: int, at: tuple[int, ...]) -> Cell:
         changes: dict[str, Any] = {}
@@ -113,7 +113,7 @@ class Sweep:
         return int.from_bytes(digest[:4], "big")
 
 
-def points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
+def grid_points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
     """Places on all axes: those of the grid, the last axis fastest, each with the values of one more axis alone."""
     choices = [range(len(axis.values)) if axis.home is None else (axis.home,) for axis in axes]
     for grid_point in itertools.product(*choices):

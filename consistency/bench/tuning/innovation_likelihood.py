@@ -50,7 +50,7 @@ def require_scorable(filter_: Filter) -> None:
         )
 
 
-def score_of(trial: Trial, estimates: Estimates) -> RunScore:
+def score_of_run_by_innovations(trial: Trial, estimates: Estimates) -> RunScore:
     """Return the likelihood of the observations of a run (Schweppe 1965, IEEE Trans. Inf. Theory 11(1), eq. 9).
 
     The observation that begins a landmark is left out, as in a diffuse likelihood: no density is stated for it.
@@ -141,7 +141,7 @@ class BeliefScorer:
 
     def _score(self, trial: Trial, belief: Belief) -> RunScore:
         [estimates] = self._isolation.run(trial, belief)
-        return score_of(trial, estimates)
+        return score_of_run_by_innovations(trial, estimates)
 
     def _tell(self) -> None:
         """Print a line of progress, every few seconds."""

@@ -50,7 +50,7 @@ class FactorFit:
     settings: int  # that were tried
 
 
-def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
+def fit_log_factors(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     """Return the setting of greatest total score, searched from the first start at which no run fails; None without.
 
     The search is COBYQA (Ragonneau & Zhang 2025; SciPy), a trust region on quadratic models without derivatives, and
@@ -72,7 +72,7 @@ def maximise(score: Scoring, starts: Sequence[Array]) -> FactorFit | None:
     best = np.clip(search_result.x, -LIMIT, LIMIT)
     edge = np.where(np.abs(best) > LIMIT - AT_LIMIT, np.sign(best), 0.0).astype(int)
     free = np.flatnonzero(edge == 0)
-    slope, curvature = derivatives(scores, best, free)
+    slope, curvature = score_derivatives(scores, best, free)
     best = _after_newton_step(scores, best, free, slope, curvature)
     interval = profile_intervals(scores, best, np.nan_to_num(curvature), LIMIT)
     return FactorFit(best, interval, tuple(edge.tolist()), scores.settings)
@@ -108,7 +108,7 @@ class KnownScores:
         return len(self._known)
 
 
-def derivatives(scores: KnownScores, x: Array, free: Sequence[int] | Array) -> tuple[Array, Array]:
+def score_derivatives(scores: KnownScores, x: Array, free: Sequence[int] | Array) -> tuple[Array, Array]:
     """Return slope (p,) and curvature (p, p) of the total by the ``free`` log factors, 0 by the others."""
     step = STEP * np.eye(len(x))
 

@@ -29,7 +29,7 @@ class NoiseGroup(NamedTuple):
     channels: tuple[str, ...]
 
 
-def groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
+def noise_groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
     """Groups as the option ``--groups`` has them: "Q,R", "Q.v,Q.omega,R" or "Q,R.u+R.v,R.d".
 
     ``Q`` and ``R`` stand for all their channels with a noise. Channels that no group names stay as they are.

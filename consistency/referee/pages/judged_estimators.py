@@ -38,7 +38,7 @@ class Clock:
             axes.set_xlim(min(0.0, float(self.values[0])), float(self.values[-1]))
 
 
-def clock_of(t: Array) -> Clock:
+def time_axis_of(t: Array) -> Clock:
     """Seconds from the first step on, or steps where not all have an increasing time.
 
     Parameters

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 OPEN = Look("#7f7f7f")
 
 
-def by_group(verdict: Verdict) -> tuple[Figure, ...]:
+def ratio_by_group_figure(verdict: Verdict) -> tuple[Figure, ...]:
     """A row for each group with its ratio and interval, a panel for each part; nothing without groups."""
     of_parts = {name: part.by_group for name, part in verdict.parts.items() if part.by_group is not None}
     if verdict.by_group is not None:

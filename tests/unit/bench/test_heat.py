@@ -128,7 +128,7 @@ def test_axes_that_vary_alone_have_a_map_each(tmp_path, capsys):
 
 def test_long_values_are_told_apart():
     axis = Axis("truth.sensor.effects", tuple([{"kind": "mismatch", "rate": rate}] * 3 for rate in (0.1, 0.2)))
-    texts = [heat.said(axis, i) for i in range(2)]
+    texts = [heat.value_in_few_characters(axis, i) for i in range(2)]
     assert len(set(texts)) == 2
     assert max(map(len, texts)) <= heat.LONGEST
 

@@ -42,7 +42,7 @@ from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
 from consistency.referee.pages import questions_table, ratio_by_axis, verdicts
-from consistency.referee.pages.judged_estimators import clock_of
+from consistency.referee.pages.judged_estimators import time_axis_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 
@@ -804,7 +804,7 @@ def test_a_long_study_takes_a_third_of_a_megabyte_of_a_page(results, tmp_path):
     study = replace(
         report.studies[0],
         steps=np.arange(1, steps + 1),
-        clock=clock_of(0.1 * np.arange(1, steps + 1)),
+        clock=time_axis_of(0.1 * np.arange(1, steps + 1)),
         tracks=tuple(long(t) for t in report.studies[0].tracks * 2),
     )
     studies = [shown(replace(report, studies=(study,) * many)) for many in (1, 2)]

@@ -53,7 +53,7 @@ class Exhibit:
     sources: tuple[Source, ...]
 
 
-def shown(report: Report, exhibits: Sequence[Exhibit]) -> tuple[Block, ...]:
+def exhibit_blocks(report: Report, exhibits: Sequence[Exhibit]) -> tuple[Block, ...]:
     """Each exhibit: its heading, its findings with published value, measured value and rule, and its tables.
 
     An exhibit without any of its tables is left out.
@@ -68,12 +68,12 @@ def shown(report: Report, exhibits: Sequence[Exhibit]) -> tuple[Block, ...]:
         found = [source.show(data) for source, data in tables if data is not None]
         if found:
             blocks.append(Heading(exhibit.title))
-            blocks += [findings_table(own, f"Findings on: {exhibit.title}")] if own else []
+            blocks += [claims_table(own, f"Findings on: {exhibit.title}")] if own else []
             blocks += found
     return tuple(blocks)
 
 
-def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "", with_rules: bool = True) -> Table:
+def claims_table(findings: Sequence[dict[str, Any]], label: str, caption: str = "", with_rules: bool = True) -> Table:
     """Claim, rule, published and measured value and verdict of each finding."""
     rows = [_row(finding, with_rules) for finding in findings]
     return table(OF_FINDINGS, rows, label, caption=caption, style="prose")
@@ -82,13 +82,13 @@ def findings_table(findings: Sequence[dict[str, Any]], label: str, caption: str 
 def all_findings(report: Report) -> tuple[Block, ...]:
     """Published claims of the folder beside what was measured."""
     caption = "Rules of acceptance are constants of the scripts, fixed before this run"
-    return (findings_table(report.findings, "Findings", caption),) if report.findings else ()
+    return (claims_table(report.findings, "Findings", caption),) if report.findings else ()
 
 
 def findings_on_paper(report: Report) -> tuple[Block, ...]:
     """The same without the rules."""
     caption = "The rule by which each is accepted, fixed before this run, stands in the HTML page"
-    return (findings_table(report.findings, "Findings", caption, with_rules=False),) if report.findings else ()
+    return (claims_table(report.findings, "Findings", caption, with_rules=False),) if report.findings else ()
 
 
 def _row(finding: dict[str, Any], with_rules: bool) -> tuple[Cell, ...]:

@@ -66,7 +66,7 @@ def further(study: Study) -> tuple[Block, ...]:
     return Heading("Further figures", 4), table(heads, rows, label, caption=OF_FURTHER, whole=whole)
 
 
-def own_errors(study: Study) -> tuple[Block, ...]:
+def own_error_table(study: Study) -> tuple[Block, ...]:
     """Filters with an error of their own: what is judged in it, and beside it in the additive error of the world."""
     rows: list[tuple[Cell, ...]] = []
     for track in study.tracks:
@@ -114,5 +114,5 @@ def rejections(study: Study) -> tuple[Block, ...]:
 
 SECTIONS: tuple[Callable[[Study], tuple[Block, ...]], ...] = (
     anees_curves, without_truth, world_map, pose_errors, innovations, diagnosis, by_axis, nees_distribution, further,
-    own_errors, maps, rejections,
+    own_error_table, maps, rejections,
 )  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import pandas as pd
 
@@ -30,20 +30,6 @@ from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 
 
-# fmt: off
-@overload
-def run_trials(
-    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
-    timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
-) -> Results: ...
-@overload
-def run_trials(
-    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
-    timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
-) -> StoredResults: ...
-# fmt: on
 def run_trials(
     scenario: Scenario,
     filters: Sequence[str | Filter],
@@ -101,20 +87,6 @@ def run_trials(
         return campaign.finish([range(runs)])
 
 
-# fmt: off
-@overload
-def run_log(
-    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., executor: Executor | None = ..., out: None = ..., resume: bool = ...,
-    overwrite: bool = ...,
-) -> Results: ...
-@overload
-def run_log(
-    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., executor: Executor | None = ..., *, out: str | Path, resume: bool = ...,
-    overwrite: bool = ...,
-) -> StoredResults: ...
-# fmt: on
 def run_log(
     log: Log,
     filters: Sequence[str | Filter],

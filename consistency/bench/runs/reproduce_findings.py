@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import pandas as pd
 from joblib.externals.loky import Future, ProcessPoolExecutor
@@ -77,7 +77,7 @@ class Study:
         missing_filters = [name for name in filters if results_so_far is None or name not in results_so_far.filters]
         if missing_filters:
             say(f"{world.name}: {', '.join(missing_filters)}")
-            new_results = run_trials(world, missing_filters, self.runs, self.seed, self.jobs)
+            new_results = cast(Results, run_trials(world, missing_filters, self.runs, self.seed, self.jobs))
             self.kept[world.name] = new_results if results_so_far is None else joined([results_so_far, new_results])
         return self.kept[world.name]
 

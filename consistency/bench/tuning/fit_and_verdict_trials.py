@@ -12,11 +12,11 @@ from consistency.bench.runs.montecarlo import require_counts, run_log, run_trial
 from consistency.bench.runs.trial_work import Simulated
 from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.store.recorded_log import Log
-from consistency.bench.store.results import Results
+from consistency.bench.store.results import Tables
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 
-Judging = Callable[[Filter, Belief, int, float | None], Results]  # with so many jobs, and seconds a trial
+Judging = Callable[[Filter, Belief, int, float | None], Tables]  # with so many jobs, and seconds a trial
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     simulated = Simulated(scenario, fit_seed)
     trials = [simulated(run) for run in range(runs)]
 
-    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
         return run_trials(with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
 
     runs_text = _runs(runs)
@@ -81,7 +81,7 @@ def _parts_of_log(log: Log) -> Parts:
         fitted_on = f"the first {middle_step} steps"
         judged_on = f"the other {only_trial.steps - middle_step}, which begin with an empty map"
 
-    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Results:
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
         return run_log(replace(log, trials=verdict_trials, belief=belief), [filter_], jobs, timeout)
 
     return Parts(log, fit_trials, on_fresh, fitted_on, judged_on, "")

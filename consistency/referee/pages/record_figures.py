@@ -160,12 +160,12 @@ def errors_of(record: Record) -> list[Errors]:
     """Of each component that is drawn."""
     assert record.error is not None
     assert record.covariance is not None
-    found = []
+    error_figures = []
     for i, name in enumerate(record.axes[:MOST_PANELS]):
         unit, factor = unit_of(name)
         bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, :, i, i], 0.0))
-        found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
-    return found
+        error_figures.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
+    return error_figures
 
 
 def _errors(record: Record) -> Picture | None:
@@ -425,13 +425,13 @@ def _shares(values: Array, limits: Array) -> Array:
 def _coverage(record: Record) -> Picture | None:
     """Share of errors within an interval against the probability that it should hold them with."""
     p = np.linspace(0.0, 0.999, 200)
-    found = observed_coverage(record, p)
-    if not found:
+    coverage_values = observed_coverage(record, p)
+    if not coverage_values:
         return None
 
     def paint(axes: Axes) -> None:
         axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
-        for number, (name, shares) in enumerate(found.items()):
+        for number, (name, shares) in enumerate(coverage_values.items()):
             look = JOINT if name == "all together" else replace(style(number), width=1.1)
             curve(axes, p, shares, look, name)
         axes.set(xlabel="stated probability", ylabel="share of errors inside", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))

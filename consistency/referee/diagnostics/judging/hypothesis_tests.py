@@ -113,8 +113,8 @@ def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
         return ()
     tests = []
     for number in range(len(sample.groups.names)):
-        found = sample.in_group(number)
-        tests.append(scale_test(found.means, sample.dof, found.longest, weights=found.counts))
+        in_group = sample.in_group(number)
+        tests.append(scale_test(in_group.means, sample.dof, in_group.longest, weights=in_group.counts))
     return tuple(tests)
 
 

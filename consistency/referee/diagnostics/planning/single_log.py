@@ -76,10 +76,10 @@ def correlation_time(series: Array) -> tuple[float, int]:
     if not covariance[0] > 0:
         return 1.0, 1
     tau = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    enough = np.arange(T) >= REACH * tau
+    window_reached = np.arange(T) >= REACH * tau
     lag = T - 1
-    if enough.any():
-        lag = int(np.argmax(enough))
+    if window_reached.any():
+        lag = int(np.argmax(window_reached))
     return max(1.0, float(tau[lag])), max(lag, 1)
 
 

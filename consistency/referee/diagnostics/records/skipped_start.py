@@ -62,10 +62,10 @@ class Skip:
         if t is None:
             t = np.full(shape, np.nan)
         times = np.broadcast_to(t, shape)
-        known = np.isfinite(times)
-        if not known.any(axis=1).all():
+        is_known = np.isfinite(times)
+        if not is_known.any(axis=1).all():
             raise ValueError(f"skip {self.option}: there are no times; give a number of steps, as --skip 20")
-        start = times[np.arange(shape[0]), np.argmax(known, axis=1)]
+        start = times[np.arange(shape[0]), np.argmax(is_known, axis=1)]
         with np.errstate(invalid="ignore"):
             return np.asarray(times - start[:, None] < self.size - ROUNDING)
 

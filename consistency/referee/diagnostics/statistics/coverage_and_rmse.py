@@ -136,21 +136,22 @@ def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     present = np.isfinite(nees) & all_finite(error) & (nees > 0)
     index = np.full(nees.shape[1], np.nan)
     inclination = np.full(nees.shape[1], np.nan)
-    count = present.sum(axis=0)
+    runs_in_step = present.sum(axis=0)
     e = np.where(present[..., None], error, 0.0)
     by_step = np.ascontiguousarray(np.moveaxis(e, 1, 0))
-    mse = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(count, 1)[:, None, None]
+    mse = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(runs_in_step, 1)[:, None, None]
     scale = np.sqrt(np.diagonal(mse, axis1=-2, axis2=-1))
-    good = (count >= 2 * n) & (scale > 0).all(axis=-1)
-    unit = np.where(good[:, None], scale, 1.0)
+    scored = (runs_in_step >= 2 * n) & (scale > 0).all(axis=-1)
+    unit = np.where(scored[:, None], scale, 1.0)
     correlation = mse / (unit[:, :, None] * unit[:, None, :])
-    good &= np.linalg.cond(np.where(good[:, None, None], correlation, np.eye(n))) < 1e12
-    if not good.any():
+    scored &= np.linalg.cond(np.where(scored[:, None, None], correlation, np.eye(n))) < 1e12
+    if not scored.any():
         return index, inclination
-    actual = squared_length(whiten(e[:, good] / unit[good], correlation[good]))
-    here = present[:, good]
+    actual = squared_length(whiten(e[:, scored] / unit[scored], correlation[scored]))
+    present_runs = present[:, scored]
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(here, 10.0 * np.log10(np.where(here, nees[:, good], 1.0) / np.where(here, actual, 1.0)), 0.0)
-    index[good] = np.abs(ratio).sum(axis=0) / count[good]
-    inclination[good] = ratio.sum(axis=0) / count[good]
+        stated_over_actual = np.where(present_runs, nees[:, scored], 1.0) / np.where(present_runs, actual, 1.0)
+        ratio = np.where(present_runs, 10.0 * np.log10(stated_over_actual), 0.0)
+    index[scored] = np.abs(ratio).sum(axis=0) / runs_in_step[scored]
+    inclination[scored] = ratio.sum(axis=0) / runs_in_step[scored]
     return index, inclination

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -181,7 +181,7 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
     print(f"e09: {len(tasks)} runs", file=sys.stderr, flush=True)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(run_log, logs[log], [name], 1) for log, name in tasks]
-        done = [(log, future.result()) for (log, _), future in zip(tasks, futures, strict=True)]
+        done = [(log, cast(cs.Results, future.result())) for (log, _), future in zip(tasks, futures, strict=True)]
     return {name: joined([part for log, part in reversed(done) if log == name]) for name in logs}
 
 

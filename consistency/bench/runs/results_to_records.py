@@ -161,7 +161,7 @@ def _first_number(values: Array) -> Array:
     is_number = np.isfinite(values)
     if not values.size:
         return np.zeros(len(values))
-    return np.where(is_number.any(axis=1), is_number.argmax(axis=1), values.shape[1])
+    return np.asarray(np.where(is_number.any(axis=1), is_number.argmax(axis=1), values.shape[1]))
 
 
 def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:

@@ -97,7 +97,7 @@ class KnownScores:
         self._shape = density.shape
         return density
 
-    def total_log_density(self, x: Array) -> float:
+    def total(self, x: Array) -> float:
         """Return the total log density; minus infinity where a run failed."""
         total_log_density = float(self(x).sum())
         return total_log_density if np.isfinite(total_log_density) else -np.inf

@@ -245,12 +245,12 @@ def plan_command(
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof
     elif like is not None:
-        from consistency.bench.runs.pilot_runs import pilots_in
+        from consistency.bench.runs.scores_by_run import pilots_in
 
         pilots = pilots_in(like, filters)
     elif scenario is not None and filters:
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
-        from consistency.bench.runs.pilot_runs import pilots_in_world
+        from consistency.bench.runs.scores_by_run import pilots_in_world
 
         pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)

@@ -65,7 +65,7 @@ def sweep_command(
         with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
             folder = run_sweep(plan, out, overwrite, jobs, executor=executor)
     from consistency.bench.pages import write_regime_reports
-    from consistency.bench.sweeps.regime_map_tables import regime_blocks
+    from consistency.bench.sweeps.regime_map import regime_blocks
     from consistency.referee.show import terminal
 
     regime = regime_of(folder)

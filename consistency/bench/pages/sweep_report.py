@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.sweeps.regime_map import Regime
-from consistency.bench.sweeps.regime_map_tables import by_verdict
+from consistency.bench.sweeps.regime_map import Regime, by_verdict
 from consistency.bench.sweeps.run_cell import CellResult
 from consistency.bench.sweeps.sweep_axes import Axis as GridAxis
 from consistency.bench.sweeps.sweep_file import Cell as GridCell

@@ -15,7 +15,7 @@ from consistency.bench.filters.filter_declarations import name_of, own_errors, r
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.resume_results import PLAN, gathered_in
 from consistency.bench.runs.rounds_of_runs import Campaign
 from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted

@@ -18,10 +18,10 @@ from joblib.externals.loky.backend import get_context
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.experiment_scripts import experiments, first_line_of, load_script
+from consistency.bench.runs.local_workers import worker_count
 from consistency.bench.runs.missing_kernels import compile_all, first_trials
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.worker_count import worker_count
 from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.results import Results, joined

@@ -11,7 +11,6 @@ from consistency.bench.protocols import Filter
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.missing_kernels import compile_all
 from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
-from consistency.bench.runs.worker_count import workers_that_fit
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
@@ -80,14 +79,6 @@ class TrialWork:
         if not isinstance(self.trials, Recorded):
             return self
         return replace(self, trials=Recorded({run: self.trials.trials[run] for run in runs}))
-
-    def room_for(self, trial: Trial, workers: int) -> int:
-        """As many of ``workers`` as have memory for a run; raises InputError where not even one has.
-
-        The trials of a scenario are alike, so that one speaks for all; of a log all are looked at.
-        """
-        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [trial]
-        return workers_that_fit(trials, workers)
 
     def compile(self, trial: Trial, jobs: int) -> None:
         """Compile what a trial needs and is not yet compiled, in ``jobs`` processes at most, and say so."""

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from consistency.bench.runs.worker_count import worker_count
+from consistency.bench.runs.local_workers import worker_count
 from consistency.bench.store.journal import Busy
 from consistency.bench.sweeps.run_cell import CellResult, run_cell
 from consistency.bench.sweeps.sweep_file import Sweep

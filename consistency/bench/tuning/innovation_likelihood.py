@@ -14,9 +14,9 @@ from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.filter_declarations import name_of, rejects
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs.local_workers import worker_count
 from consistency.bench.runs.missing_kernels import compile_all
 from consistency.bench.runs.run_outcome import outcome_of
-from consistency.bench.runs.worker_count import worker_count
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError

@@ -14,8 +14,7 @@ from consistency.referee.document.blocks import Chapter, Document, Facts, Text
 from consistency.referee.pages import questions_table, verdicts
 from consistency.referee.pages.judged_estimators import Estimator, Judged, time_axis_of
 from consistency.referee.pages.manifest_facts import facts
-from consistency.referee.pages.ratio_by_axis import by_axis
-from consistency.referee.pages.ratio_by_group import ratio_by_group_figure
+from consistency.referee.pages.ratio_figures import by_axis, ratio_by_group_figure
 from consistency.referee.pages.record_figures import record_figures
 
 

@@ -20,7 +20,7 @@ from consistency.bench.runs import executor_batches
 from consistency.bench.runs.backends.choose_executor import executor_for
 from consistency.bench.runs.executor_batches import BatchResult, ExecutorWorkers, do_batch, failed
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork
 from consistency.bench.store.results import open_results

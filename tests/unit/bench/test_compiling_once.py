@@ -17,7 +17,7 @@ import consistency as cs
 from consistency.bench.filters.compiler import jit
 from consistency.bench.filters.compiler.whole_program import remembered_types
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 

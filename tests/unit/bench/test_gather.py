@@ -20,7 +20,7 @@ import pytest
 from edited import accept_changes, content
 
 import consistency as cs
-from consistency.bench.runs import local_threads, outcomes_to_results, trial_work
+from consistency.bench.runs import local_workers, outcomes_to_results, trial_work
 from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
 from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.simulation import World
@@ -154,7 +154,7 @@ def test_few_outcomes_wait_for_their_turn(uvd, tmp_path, monkeypatch):
         return outcome
 
     monkeypatch.setattr(trial_work, "outcome_of", counted)
-    monkeypatch.setattr(local_threads, "AHEAD", 2)
+    monkeypatch.setattr(local_workers, "AHEAD", 2)
     cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
     assert len(most) == 60
     assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
@@ -338,16 +338,16 @@ class Work:
 
 
 def test_what_ends_together_with_an_error_counts(monkeypatch):
-    monkeypatch.setattr(local_threads, "SimpleQueue", Together)
-    outcomes = local_threads.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
+    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
+    outcomes = local_workers.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):
         next(outcomes)
 
 
 def test_what_ends_together_leaves_room_for_as_many(monkeypatch):
-    monkeypatch.setattr(local_threads, "SimpleQueue", Together)
-    outcomes = local_threads.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
+    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
+    outcomes = local_workers.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
     assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 

@@ -41,7 +41,7 @@ from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
-from consistency.referee.pages import questions_table, ratio_by_axis, verdicts
+from consistency.referee.pages import questions_table, ratio_figures, verdicts
 from consistency.referee.pages.judged_estimators import time_axis_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
@@ -123,7 +123,7 @@ def without_studies(folder):
 
 
 def axis_caption(study):
-    return ratio_by_axis.axis_caption(study, ratio_by_axis.forests(study))
+    return ratio_figures.axis_caption(study, ratio_figures.forests(study))
 
 
 def with_tracks(report, *tracks):
@@ -246,14 +246,14 @@ def test_verdict_cells_are_the_records(report):
 def test_the_diagnosis_is_what_the_verdict_holds(report):
     (study,) = report.studies
     asked = {question.name: question.answers for question in questions_table.asked(study)}
-    by_name = {part.name: dict(part.rows) for part in ratio_by_axis.forests(study)}
+    by_name = {part.name: dict(part.rows) for part in ratio_figures.forests(study)}
     for number, track in enumerate(study.tracks):
         v = track.verdict
         assert {q for q, answers in asked.items() if answers[number]} == {a.question for a in v.answers}
         for one in v.answers:
             assert asked[one.question][number] is one
         assert by_name["ratio"]["x"][number] == v.axes.inflation["x"]
-        assert by_name["ratio"][ratio_by_axis.WHOLE][number] == v.scale.inflation
+        assert by_name["ratio"][ratio_figures.WHOLE][number] == v.scale.inflation
         assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * v.accuracy.coverage_one_step[1])
         assert by_name["bias"]["heading"][number] == v.bias.by_axis["heading"]
         of = nees_distribution.steps(track)
@@ -292,8 +292,8 @@ def test_windows_are_finite_and_hold_every_value(report, ends):
         bias=replace(v.bias, by_axis={"x": Interval(-4.0, -ends[1], ends[1])}),
     )
     study = replace(study, tracks=(replace(track, verdict=v),))
-    assert {part.name for part in ratio_by_axis.forests(study)} == {"ratio", "bias", "coverage"}
-    for part in ratio_by_axis.forests(study):
+    assert {part.name for part in ratio_figures.forests(study)} == {"ratio", "bias", "coverage"}
+    for part in ratio_figures.forests(study):
         low, high = part.window
         assert np.isfinite(part.window).all()
         values = [interval[0] for _, row in part.rows for interval in row if interval] + [part.expected]
@@ -329,8 +329,8 @@ def test_nees_alone_without_axes(report):
     whole = judge(Record("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
     study = replace(study, tracks=(track,))
-    (part,) = ratio_by_axis.forests(study)
-    assert [label for label, _ in part.rows] == [ratio_by_axis.WHOLE]
+    (part,) = ratio_figures.forests(study)
+    assert [label for label, _ in part.rows] == [ratio_figures.WHOLE]
     assert printed(replace(report, studies=(study,))).startswith(b"%PDF")
 
 
@@ -426,8 +426,8 @@ def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(report):
     error[..., :2] = error[..., :2] @ np.array([[1.25, 0.95], [0.95, 1.25]])  # x and y err together
     track = judged(report.studies[0].tracks[0], 0.7 * error, P, Settings(0.05, allow="conservative"))
     (study,) = with_tracks(report, track).studies
-    ratios = dict(ratio_by_axis.forests(study)[0].rows)
-    assert ratios[ratio_by_axis.DIRECTION] == (track.verdict.axes.largest,)
+    ratios = dict(ratio_figures.forests(study)[0].rows)
+    assert ratios[ratio_figures.DIRECTION] == (track.verdict.axes.largest,)
     assert DIRECTION in {question.name for question in questions_table.asked(study) if question.answers[0].found}
     assert "Shown inside (0,\u00a01.50]" in row(study, track)
     assert "Worst direction: chosen by one half of the runs" in axis_caption(study)
@@ -905,9 +905,9 @@ def test_the_front_end_is_what_its_tables_hold(reproduced):
 
 def test_the_forest_has_the_interval_of_each_axis_in_its_row(report):
     (study,) = report.studies
-    found = ratio_by_axis.forests(study)
-    labels = ratio_by_axis.row_labels(found)
-    drawn_panels = panels(ratio_by_axis.by_axis(study)[0])
+    found = ratio_figures.forests(study)
+    labels = ratio_figures.row_labels(found)
+    drawn_panels = panels(ratio_figures.by_axis(study)[0])
     assert [label.get_text() for label in drawn_panels[0].get_yticklabels()] == list(labels)
     for axes, forest in zip(drawn_panels, found, strict=True):
         for number, track in enumerate(study.tracks):

@@ -19,7 +19,7 @@ from consistency.referee.diagnostics.records.groups_by_column import Column, col
 from consistency.referee.diagnostics.records.outcome_columns import made_from_errors, selects_on_outcome
 from consistency.referee.diagnostics.statistics.number_of_runs import group_runs, power_of, required_runs
 from consistency.referee.diagnostics.verdict.answers import GROUP, SHARES, shares_of
-from consistency.referee.pages.ratio_by_group import ratio_by_group_figure
+from consistency.referee.pages.ratio_figures import ratio_by_group_figure
 
 
 def errors(runs=40, steps=20, n=2, seed=1):

@@ -22,7 +22,7 @@ from consistency.referee.document.map import COLUMNS as MAP_COLUMNS
 from consistency.referee.document.map import map_cells
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.pages.questions_table import diagnosis
-from consistency.referee.pages.ratio_by_axis import by_axis
+from consistency.referee.pages.ratio_figures import by_axis
 
 OF_FURTHER = (
     "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "

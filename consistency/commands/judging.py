@@ -230,6 +230,7 @@ def plan_command(
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.needed_runs import plan_lines
+    from consistency.referee.verdicts.planned_runs import pilots_of_records
     from consistency.referee.verdicts.planned_runs import plan as plan_runs
 
     if scenario is not None and like is not None:
@@ -240,19 +241,21 @@ def plan_command(
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
     pilots, pilot_dof = None, len(POSE)
     if like is not None and are_files(like, Reading()):
-        from consistency.referee.verdicts.planned_runs import pilots_of_records
-
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof
-    elif like is not None:
-        from consistency.bench.runs.scores_by_run import pilots_in
-
-        pilots = pilots_in(like, filters)
-    elif scenario is not None and filters:
+    elif like is not None or (scenario is not None and filters):
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
-        from consistency.bench.runs.scores_by_run import pilots_in_world
+        from consistency.bench.runs import montecarlo, results_to_records
+        from consistency.bench.scenario import load_scenario
+        from consistency.bench.store.results import open_results
 
-        pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
+        if like is not None:
+            results = open_results(like)
+        else:
+            results = montecarlo.run_trials(load_scenario(str(scenario)), filters or (), pilot_runs, seed)
+        pilots = {}
+        for record in results_to_records.records_of_results(results, filters):  # one in memory at a time
+            pilots |= pilots_of_records([record])[0]
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
     if as_json:
         print(json.dumps(planned, indent=2))

@@ -17,8 +17,8 @@ from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.resume_results import PLAN, gathered_in
-from consistency.bench.runs.rounds_of_runs import Campaign
 from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted
+from consistency.bench.runs.rounds_of_runs import StudyRounds
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
@@ -82,9 +82,9 @@ def run_trials(
     with studied(
         scenario, filters, seed, workers_for(jobs, executor), timeout, memory, out=out, previous=previous,
         resume=resume, overwrite=overwrite,
-    ) as campaign:  # fmt: skip
-        campaign.gathered.require_more(runs)
-        return campaign.finish([range(runs)])
+    ) as study_rounds:  # fmt: skip
+        study_rounds.gathered.require_more(runs)
+        return study_rounds.finish([range(runs)])
 
 
 def run_log(
@@ -110,7 +110,7 @@ def run_log(
     fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
     place = None if out is None else Path(out)
     with gathered_in(_known(instances) | own, place, None, resume, overwrite) as gathered:
-        return Campaign(workers_for(jobs, executor), work, gathered, fields, log.landmarks).finish([sorted(trials)])
+        return StudyRounds(workers_for(jobs, executor), work, gathered, fields, log.landmarks).finish([sorted(trials)])
 
 
 def workers_for(jobs: int, executor: Executor | None) -> Workers:
@@ -133,7 +133,7 @@ def studied(
     overwrite: bool,
     plan: Mapping[str, Any] | None = None,
     journal: Journal | None = None,
-) -> Iterator[Campaign]:
+) -> Iterator[StudyRounds]:
     """Runs of a scenario, continued from earlier ones; see :func:`run_trials`, which raises the same exceptions.
 
     Parameters
@@ -149,7 +149,7 @@ def studied(
     fields = {"seed": seed} | _scenario_entry(scenario) | planned
     place = None if out is None else Path(out)
     with gathered_in(known, place, previous, resume, overwrite, journal) as gathered:
-        yield Campaign(workers, work, gathered, fields, _landmarks_table(scenario))
+        yield StudyRounds(workers, work, gathered, fields, _landmarks_table(scenario))
 
 
 def _known(filters: Sequence[Filter]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ class Interrupted(KeyboardInterrupt):
         self.results = results
 
 
-class Campaign:
+class StudyRounds:
     """Runs that are done and gathered.
 
     Parameters

@@ -11,7 +11,7 @@ from typing import Any
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.montecarlo import studied, workers_for
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.rounds_of_runs import Campaign
+from consistency.bench.runs.rounds_of_runs import StudyRounds
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.results import Results, StoredResults, Tables
@@ -77,39 +77,41 @@ def run_until_decided(
     with studied(
         scenario, filters, seed, workers_for(jobs, executor), timeout, memory,
         out=out, previous=previous, resume=resume, overwrite=overwrite, plan=plan, journal=journal,
-    ) as campaign:  # fmt: skip
-        _require_less(campaign, max_runs)
-        names = campaign.gathered.filters
+    ) as study_rounds:  # fmt: skip
+        _require_less(study_rounds, max_runs)
+        names = study_rounds.gathered.filters
 
         def read(runs: int, name: str) -> Record:
-            return record_of(campaign.so_far(runs), name, scenario.truth.steps)
+            return record_of(study_rounds.so_far(runs), name, scenario.truth.steps)
 
-        results = campaign.finish(_rounds(campaign, looks(design, names, read, decided), decided, names))
+        results = study_rounds.finish(
+            _runs_up_to_looks(study_rounds, looks(design, names, read, decided), decided, names)
+        )
     return results, {name: decided[name] for name in names}
 
 
-def _rounds(
-    campaign: Campaign, counts: Iterator[int], decided: dict[str, Verdict], names: list[str]
+def _runs_up_to_looks(
+    study_rounds: StudyRounds, counts: Iterator[int], decided: dict[str, Verdict], names: list[str]
 ) -> Iterator[range]:
     """Runs up to each look; says how it stands after those that were new."""
     is_new, runs = False, 0
     for runs_at_look in counts:
         if is_new:
             say(f"{runs} runs: {progress_text(decided, names)}")
-        runs, is_new = runs_at_look, not campaign.gathered.finished.issuperset(range(runs_at_look))
+        runs, is_new = runs_at_look, not study_rounds.gathered.finished.issuperset(range(runs_at_look))
         yield range(runs)
     if is_new:
         say(f"{runs} runs: {progress_text(decided, names)}")
-    elif campaign.gathered.is_complete:
-        done = len(campaign.gathered.finished)
+    elif study_rounds.gathered.is_complete:
+        done = len(study_rounds.gathered.finished)
         raise InputError(f"the {done} runs of the results to resume have decided every filter")
 
 
-def _require_less(campaign: Campaign, max_runs: int | None) -> None:
+def _require_less(study_rounds: StudyRounds, max_runs: int | None) -> None:
     """Refuse results to which no run can be added."""
-    finished_runs = campaign.gathered.finished
+    finished_runs = study_rounds.gathered.finished
     runs = next(run for run in count() if run not in finished_runs)
-    if max_runs is not None and (runs > max_runs or (runs == max_runs and campaign.gathered.is_complete)):
+    if max_runs is not None and (runs > max_runs or (runs == max_runs and study_rounds.gathered.is_complete)):
         raise InputError(f"the results to resume have {runs} runs; the plan looks for the last time at {max_runs}")
 
 

@@ -1,25 +1,30 @@
 """Pilots of a plan are the runs that were asked for."""
 
+import json
+
 import numpy as np
 
-from consistency.bench.runs import scores_by_run
+from consistency.bench.runs import montecarlo, results_to_records
+from consistency.commands.app import main
 from consistency.diagnostics import Record
 
 
-def test_a_pilot_runs_what_it_is_told(monkeypatch):
+def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
     asked = []
+    nees = np.random.default_rng(5).chisquare(3, (40, 5))
 
     def run_trials(scenario, *rest):
         asked.append((scenario.name, *rest))
         return "results"
 
-    def records_of(results, filters):
+    def records_of_results(results, filters):
         asked.append((results, filters))
-        return [Record("kf", nees=np.full((40, 5), 6.0), dof=3, t=np.arange(5.0))]
+        return [Record("kf", nees=nees, dof=3, t=np.arange(5.0))]
 
-    monkeypatch.setattr(scores_by_run, "run_trials", run_trials)
-    monkeypatch.setattr(scores_by_run, "records_of_results", records_of)
-    ((name, (means, steps)),) = scores_by_run.pilots_in_world("linear-gaussian", ["kf"], 40, 7).items()
+    monkeypatch.setattr(montecarlo, "run_trials", run_trials)
+    monkeypatch.setattr(results_to_records, "records_of_results", records_of_results)
+    main(["plan", "linear-gaussian", "--filter", "kf", "--pilot-runs", "40", "--seed", "7", "--json"])
     assert asked == [("linear-gaussian", ["kf"], 40, 7), ("results", ["kf"])]
-    assert (name, steps) == ("kf", 5)
-    np.testing.assert_array_equal(means, np.full(40, 2.0))
+    like = json.loads(capsys.readouterr().out)["like"]
+    assert list(like) == ["kf"]
+    assert like["kf"]["pilot_runs"] == 40

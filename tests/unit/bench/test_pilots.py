@@ -19,12 +19,13 @@ def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
 
     def records_of_results(results, filters):
         asked.append((results, filters))
-        return [Record("kf", nees=nees, dof=3, t=np.arange(5.0))]
+        return (Record(name, nees=nees, dof=3, t=np.arange(5.0)) for name in filters)
 
     monkeypatch.setattr(montecarlo, "run_trials", run_trials)
     monkeypatch.setattr(results_to_records, "records_of_results", records_of_results)
-    main(["plan", "linear-gaussian", "--filter", "kf", "--pilot-runs", "40", "--seed", "7", "--json"])
-    assert asked == [("linear-gaussian", ["kf"], 40, 7), ("results", ["kf"])]
+    filters = ["kf", "ekf-xyz"]
+    named = [word for name in filters for word in ("--filter", name)]
+    main(["plan", "linear-gaussian", *named, "--pilot-runs", "40", "--seed", "7", "--json"])
+    assert asked == [("linear-gaussian", filters, 40, 7), ("results", filters)]
     like = json.loads(capsys.readouterr().out)["like"]
-    assert list(like) == ["kf"]
-    assert like["kf"]["pilot_runs"] == 40
+    assert {name: pilot["pilot_runs"] for name, pilot in like.items()} == dict.fromkeys(filters, 40)

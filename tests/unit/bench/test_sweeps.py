@@ -134,6 +134,17 @@ def test_axes_that_vary_alone_are_no_product(at):
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
 
 
+DAMAGED = [{"grid": {}}, {"grid": {"odometry": []}}, {"grid": {"odometry": ["loud"]}}, {"filters": "kf"}, {"seed": "a"},
+           {"rule": 5}, {"base": "herath2007-stereo"}, {"grid": {"odometry": list(range(1, 20_003))}}]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGED, ids=lambda damage: str(damage)[:40])
+def test_a_sweep_that_was_damaged_in_its_folder_is_refused(at, damage):
+    content = describe(load_sweep(at)) | damage
+    with pytest.raises(cs.InputError, match="key 'sweep' is damaged; write it again"):
+        sweep_from({"sweep": content}, at)
+
+
 def test_a_sweep_without_a_grid_starts_from_its_base(at):
     path = edited(at, "[grid]\nodometry = [1.0, 2.0]\ndensity", "[alone]\ndensity")
     sweep = load_sweep(path)

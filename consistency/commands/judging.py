@@ -239,7 +239,8 @@ def plan_command(
         raise InputError("--filter goes with a SCENARIO or --like RESULTS")
     if scenario is not None and not filters:
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
-    pilots, pilot_dof = None, len(POSE)
+    pilots: dict[str, Any] | None = None
+    pilot_dof = len(POSE)
     if like is not None and are_files(like, Reading()):
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof
@@ -247,8 +248,9 @@ def plan_command(
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
         from consistency.bench.runs import montecarlo, results_to_records
         from consistency.bench.scenario import load_scenario
-        from consistency.bench.store.results import open_results
+        from consistency.bench.store.results import Tables, open_results
 
+        results: Tables
         if like is not None:
             results = open_results(like)
         else:

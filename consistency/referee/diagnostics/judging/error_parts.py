@@ -189,31 +189,30 @@ def by_group_of(
     groups = sample.groups
     if groups is None:
         return None
-    group_results = [sample.in_group(number) for number in range(len(groups.names))]
-    groups_with_runs = sum(len(in_group.means) > 0 for in_group in group_results)
-    group_question_asked = any(answer.question == GROUP for answer in given)
+    found = [sample.in_group(number) for number in range(len(groups.names))]
+    there = sum(len(one.means) > 0 for one in found)
+    is_asked = any(answer.question == GROUP for answer in given)
     is_found = GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
-    confidence = 1.0 - (1.0 - CONFIDENCE) / max(groups_with_runs, 1)
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
     from consistency.referee.diagnostics.records.groups_by_column import spans_of
 
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)
-    for number, (name, in_group) in enumerate(zip(groups.names, group_results, strict=True)):
-        if not len(in_group.means):
+    for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
+        if not len(one.means):
             continue
-        shown = equivalence(in_group.means, sample.dof, in_group.longest, both_sides, factor, weights=in_group.counts)
+        shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
         p_value = float("nan")
         status = ""
-        if group_question_asked:
-            p_value = min(1.0, sided_p_value(tests.groups[number], settings) * groups_with_runs)
+        if is_asked:
+            p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
             is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
-        ratio = ratio_interval(in_group.means, sample.dof, confidence, in_group.counts)
+        ratio = ratio_interval(one.means, sample.dof, confidence, one.counts)
         span = None if spans is None else spans[number]
-        runs, steps = len(in_group.means), int(in_group.counts.sum())
-        by_group.append(Group(name, runs, steps, ratio, p_value, shown, status, span))
+        by_group.append(Group(name, len(one.means), int(one.counts.sum()), ratio, p_value, shown, status, span))
     without = int((sample.counted & (groups.index < 0)).sum())
     return ByGroup(groups.column, tuple(by_group), groups.outcome, without)
 
@@ -232,23 +231,22 @@ def bias_of(sample: Sample, step: int | None, location: Location, faults: set[st
     def means(error: Array, covariance: Array, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))
 
-    run_means = by_runs(means, sample.error[:, late], sample.covariance[:, late], sample.counted[:, late])
-    run_means = run_means[np.isfinite(run_means).all(axis=-1)]
+    of_runs = by_runs(means, sample.error[:, late], sample.covariance[:, late], sample.counted[:, late])
+    of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     by_axis = {}
-    if len(run_means) > sample.dof:
-        test = hotelling(run_means, CONFIDENCE)
+    if len(of_runs) > sample.dof:
+        test = hotelling(of_runs, CONFIDENCE)
         for i, axis in enumerate(sample.names):
             by_axis[axis] = Interval(test.mean[i], *test.interval[i])
     if not faults & set(BIAS):
         return Bias(by_axis, step, None, None, None)
-    ratio_without_bias = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
+    without = ratio_interval(sample.centred_means(late), sample.dof, CONFIDENCE)
     if step is None:
-        return Bias(by_axis, step, None, None, ratio_without_bias)
-    standardised_errors = standardise(sample.error[:, step - 1], sample.covariance[:, step - 1])
-    standardised_errors = standardised_errors[sample.counted[:, step - 1]]
-    mean = standardised_errors.mean(axis=0)
-    chief = int(np.argmax(np.abs(mean) / standardised_errors.std(axis=0, ddof=1).clip(TINIEST)))  # what stands out most
-    return Bias(by_axis, step, sample.names[chief], float(mean[chief]), ratio_without_bias)
+        return Bias(by_axis, step, None, None, without)
+    at = standardise(sample.error[:, step - 1], sample.covariance[:, step - 1])[sample.counted[:, step - 1]]
+    mean = at.mean(axis=0)
+    chief = int(np.argmax(np.abs(mean) / at.std(axis=0, ddof=1).clip(TINIEST)))  # what stands out most
+    return Bias(by_axis, step, sample.names[chief], float(mean[chief]), without)
 
 
 def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float) -> Shape | None:
@@ -259,33 +257,33 @@ def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float)
     """
     if tests.matrix is None or sample.dof == 1:
         return None
-    shape_steps = slice(None)
+    here = slice(None)
     if tests.shape_step is not None and "shape" not in faults:
-        shape_steps = slice(tests.shape_step - 1, tests.shape_step)
-    counted = sample.counted[:, shape_steps]
+        here = slice(tests.shape_step - 1, tests.shape_step)
+    counted = sample.counted[:, here]
     if not counted.any():
         return Shape(tests.matrix, tests.shape_step, None, float("nan"), float("nan"))
-    gap, stated = _correlations(sample.error[:, shape_steps], sample.covariance[:, shape_steps], counted)
-    shown_pairs = np.zeros(gap.shape, bool)
+    gap, stated = _correlations(sample.error[:, here], sample.covariance[:, here], counted)
+    shown = np.zeros(gap.shape, bool)
     if faults & {*SCALE, *SHAPE}:
-        shown_pairs = _shown_pairs(sample, shape_steps, NAMING * false_alarm)
-    clear_correlation = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
+        shown = _shown_pairs(sample, here, NAMING * false_alarm)
+    clear = SIGN / np.sqrt(max(int(counted.any(axis=1).sum()), 1))
     actual = stated + gap
-    opposite_sign = (actual * stated < 0.0) & (np.abs(actual) > clear_correlation) & (np.abs(stated) > VISIBLE)
-    opposite_sign &= bool(faults & set(SHAPE))
+    opposite = (actual * stated < 0.0) & (np.abs(actual) > clear) & (np.abs(stated) > VISIBLE)
+    opposite &= bool(faults & set(SHAPE))
     farthest = pair = _largest(gap)
-    if shown_pairs.any():
-        pair = _largest(np.where(shown_pairs, gap, 0.0))
-    axes_right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in sample.names)
+    if shown.any():
+        pair = _largest(np.where(shown, gap, 0.0))
+    right = all(tests.axes[axis].p_value * len(tests.axes) > false_alarm for axis in sample.names)
     return Shape(
         matrix=tests.matrix,
         step=tests.shape_step,
         pair=pair,
         actual=float(actual[pair]),
         stated=float(stated[pair]),
-        wrong_sign=bool(opposite_sign[pair]),
-        alone=bool(opposite_sign[farthest]) and axes_right,
-        shown=bool(shown_pairs[pair]),
+        wrong_sign=bool(opposite[pair]),
+        alone=bool(opposite[farthest]) and right,
+        shown=bool(shown[pair]),
     )
 
 
@@ -299,14 +297,14 @@ def _shown_pairs(sample: Sample, here: slice, false_alarm: float) -> Array:
     """
     counted = sample.counted
     pairs = sample.dof * (sample.dof - 1) // 2
-    steps_and_looks = [(slice(None), pairs)]
+    found = [(slice(None), pairs)]
     if here != slice(None):
-        steps_and_looks = [(slice(None), 2 * pairs), (here, 2 * pairs * int(counted.any(axis=0).sum()))]
-    shown_pairs = np.zeros((sample.dof, sample.dof), bool)
-    for steps, looks in steps_and_looks:
+        found = [(slice(None), 2 * pairs), (here, 2 * pairs * int(counted.any(axis=0).sum()))]
+    shown = np.zeros((sample.dof, sample.dof), bool)
+    for steps, looks in found:
         p_values = pair_p_values(sample.error[:, steps], sample.covariance[:, steps], counted[:, steps])
-        shown_pairs |= p_values * looks <= false_alarm
-    return shown_pairs
+        shown |= p_values * looks <= false_alarm
+    return shown
 
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
@@ -365,18 +363,18 @@ def _correlations(error: Array, covariance: Array, counted: Array) -> tuple[Arra
     count = int(counted.sum())
     mean = np.zeros(n)
     stated = np.zeros((n, n))
-    second_moments = np.zeros((n, n))
-    blocks = list(block_slices(*counted.shape))
-    for block in blocks:
-        mean += standardise(error[block], covariance[block])[counted[block]].sum(axis=0)
+    second = np.zeros((n, n))
+    parts = list(block_slices(*counted.shape))
+    for here in parts:
+        mean += standardise(error[here], covariance[here])[counted[here]].sum(axis=0)
     mean /= count
-    for block in blocks:
-        centred = standardise(error[block], covariance[block])[counted[block]] - mean
-        second_moments += centred.T @ centred / count
-        stated += _sum_of_correlations(covariance[block][counted[block]]) / count
-    scale = np.sqrt(np.diag(second_moments))
+    for here in parts:
+        e = standardise(error[here], covariance[here])[counted[here]] - mean
+        second += e.T @ e / count
+        stated += _sum_of_correlations(covariance[here][counted[here]]) / count
+    scale = np.sqrt(np.diag(second))
     with np.errstate(invalid="ignore", divide="ignore"):
-        gap = np.nan_to_num(second_moments / np.outer(scale, scale) - stated)
+        gap = np.nan_to_num(second / np.outer(scale, scale) - stated)
     np.fill_diagonal(gap, 0.0)
     return gap, stated
 

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from consistency.bench.runs import montecarlo, results_to_records
 from consistency.commands.app import main
@@ -25,7 +26,9 @@ def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
     monkeypatch.setattr(results_to_records, "records_of_results", records_of_results)
     filters = ["kf", "ekf-xyz"]
     named = [word for name in filters for word in ("--filter", name)]
-    main(["plan", "linear-gaussian", *named, "--pilot-runs", "40", "--seed", "7", "--json"])
+    with pytest.raises(SystemExit) as end:
+        main(["plan", "linear-gaussian", *named, "--pilot-runs", "40", "--seed", "7", "--json"])
+    assert not end.value.code, capsys.readouterr().err
     assert asked == [("linear-gaussian", filters, 40, 7), ("results", filters)]
     like = json.loads(capsys.readouterr().out)["like"]
     assert {name: pilot["pilot_runs"] for name, pilot in like.items()} == dict.fromkeys(filters, 40)

@@ -134,13 +134,13 @@ def test_axes_that_vary_alone_are_no_product(at):
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
 
 
-DAMAGED = [{"grid": {}}, {"grid": {"odometry": []}}, {"grid": {"odometry": ["loud"]}}, {"filters": "kf"}, {"seed": "a"},
+DAMAGED = [{"grid": {}, "alone": {}}, {"grid": {"odometry": []}}, {"grid": {"odometry": ["loud"]}}, {"filters": "kf"}, {"seed": "a"},
            {"rule": 5}, {"base": "herath2007-stereo"}, {"grid": {"odometry": list(range(1, 20_003))}}]  # fmt: skip
 
 
 @pytest.mark.parametrize("damage", DAMAGED, ids=lambda damage: str(damage)[:40])
 def test_a_sweep_that_was_damaged_in_its_folder_is_refused(at, damage):
-    content = describe(load_sweep(at)) | damage
+    content = describe(load_sweep("small")) | damage
     with pytest.raises(cs.InputError, match="key 'sweep' is damaged; write it again"):
         sweep_from({"sweep": content}, at)
 

@@ -134,8 +134,16 @@ def test_axes_that_vary_alone_are_no_product(at):
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
 
 
-DAMAGED = [{"grid": {}, "alone": {}}, {"grid": {"odometry": []}}, {"grid": {"odometry": ["loud"]}}, {"filters": "kf"}, {"seed": "a"},
-           {"rule": 5}, {"base": "herath2007-stereo"}, {"grid": {"odometry": list(range(1, 20_003))}}]  # fmt: skip
+DAMAGED = [
+    {"grid": {}, "alone": {}},
+    {"grid": {"odometry": []}},
+    {"grid": {"odometry": ["loud"]}},
+    {"grid": {"odometry": list(range(1, 20_003))}},
+    {"filters": "kf"},
+    {"seed": "a"},
+    {"rule": 5},
+    {"base": "herath2007-stereo"},
+]
 
 
 @pytest.mark.parametrize("damage", DAMAGED, ids=lambda damage: str(damage)[:40])

@@ -59,10 +59,15 @@ class BiasEstimate:
 
     def matrix(self, k: int) -> Array:
         """What is believed of u, v or d, (L, K)."""
-        return np.asarray(self.believed[k].reshape(len(self.grid.v), len(self.grid.u)))
+        return self.believed[k].reshape(len(self.grid.v), len(self.grid.u))
 
 
-def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate: float) -> BiasEstimate:
+def estimate_bias(
+    fits: Sequence[LikelihoodFit],
+    grid: Grid,
+    level: float,
+    rate: float,
+) -> BiasEstimate:
     """Bias of each coordinate from its fit.
 
     Parameters
@@ -75,10 +80,12 @@ def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate:
     p_value = np.ones(3)
     for k, fit in enumerate(fits):
         beta, width, C = coordinate_fit.bias_coefficients(fit, level)
-        value[k, known], half[k, known] = beta[known], width[known]
+        value[k, known] = beta[known]
+        half[k, known] = width[known]
         if not known.any():
             continue
-        b, S = beta[known], C[np.ix_(known, known)]
+        b = beta[known]
+        S = C[np.ix_(known, known)]
         p_value[k] = float(stats.chi2.sf(b @ np.linalg.solve(S, b), len(b)))
         if p_value[k] < rate:
             believed[k, known] = shrunken(b, S)
@@ -100,4 +107,4 @@ def shrunken(b: Array, S: Array) -> Array:
 
     top = np.log(np.abs(b).max() + np.sqrt(values.max()) + 1e-9) + 1.0
     w2 = np.exp(2.0 * optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded").x)
-    return np.asarray(axes @ (along * w2 / (w2 + values)))
+    return axes @ (along * w2 / (w2 + values))

@@ -133,14 +133,25 @@ def characterise(
         fits[2] = by_disparity if shown else fits[2]
     u, v, d = (_coordinate(k, each, kept, levels, alone) for k, each in enumerate(fits))
     return Characterisation(
-        sensor, source, (u, v, d), growth,
+        sensor,
+        source,
+        (u, v, d),
+        growth,
         estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
-        rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
+        rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")),
+        tracks,
+        len(kept),
         {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
-        levels, kept,
-        ratio=moving_over_rest(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)),
-                               kept.moving, kept.track, levels.of("sigma")),
-    )  # fmt: skip
+        levels,
+        kept,
+        ratio=moving_over_rest(
+            np.column_stack([f.regression.residual for f in fits]),
+            np.ones((len(kept), 3)),
+            kept.moving,
+            kept.track,
+            levels.of("sigma"),
+        ),
+    )
 
 
 def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tuple[Array, Array]:
@@ -154,7 +165,14 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
 
 
 def _fitted(
-    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: RowSelection, source: str, alone: bool
+    data: Residuals,
+    k: int,
+    X: Array,
+    ridge: Array,
+    G: Array,
+    chosen: RowSelection,
+    source: str,
+    alone: bool,
 ) -> LikelihoodFit:
     """The fit of coordinate ``k``; nodes without any data are not parameters."""
     rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
@@ -164,17 +182,29 @@ def _fitted(
         raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
 
 
-def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
-    r, rows = kept.r[:, k], of.rows
+def _coordinate(
+    k: int,
+    of: LikelihoodFit,
+    kept: Residuals,
+    levels: Levels,
+    alone: bool,
+) -> Coordinate:
+    r = kept.r[:, k]
+    rows = of.rows
     n = np.diff(np.append(rows.first, len(r)))
     centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
     lags, bounds = coordinate_fit.autocorrelation(of)
     memory = rows.length >= 1.5 and not alone
     w = of.regression.residual
     return Coordinate(
-        NAMES[k], coordinate_fit.noise_interval(of, levels.of("sigma")), float(r.std(ddof=1)),
+        NAMES[k],
+        coordinate_fit.noise_interval(of, levels.of("sigma")),
+        float(r.std(ddof=1)),
         float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
         coordinate_fit.correlation(of, levels.of("correlation")) if memory else None,
         coordinate_fit.offset_share(of, levels.of("offset")) if memory else None,
-        tails(w, levels.of("tails")), lags, bounds, w / w.std(),
-    )  # fmt: skip
+        tails(w, levels.of("tails")),
+        lags,
+        bounds,
+        w / w.std(),
+    )

@@ -12,7 +12,7 @@ from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
 from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
 from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.log_residuals import MAD
+from consistency.stereo.characterising.log_residuals import robust_sd
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
@@ -65,12 +65,21 @@ def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
 def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
     """A sensor of which only the calibration is known; its noise is a placeholder."""
     return PicturedSensor(
-        model="uvd", sigma=(1.0, 1.0, 1.0), f=float(rig.K_left[0, 0]), B=float(rig.baseline), image=rig.image_size,
+        model="uvd",
+        sigma=(1.0, 1.0, 1.0),
+        f=float(rig.K_left[0, 0]),
+        B=float(rig.baseline),
+        image=rig.image_size,
         principal_point=(float(rig.K_left[0, 2]), float(rig.K_left[1, 2])),
-    )  # fmt: skip
+    )
 
 
-def _seen(rig: StereoRig, motions: list[RelativeMotion], R: Array, t: Array) -> Seen:
+def _seen(
+    rig: StereoRig,
+    motions: list[RelativeMotion],
+    R: Array,
+    t: Array,
+) -> Seen:
     rows = observations(rig, motions).sort_values(["piece", "step"])
     step = rows["step"].to_numpy(np.int64)
     z = rows[["z0", "z1", "z2"]].to_numpy(float)
@@ -84,8 +93,7 @@ def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:
     """A note on the rows of matches, which should be equal in both images."""
     pixels = np.concatenate([m.uv1[m.inliers] for m in motions])
     gap = pixels[:, 1] - pixels[:, 3] - (rig.K_left[1, 2] - rig.K_right[1, 2])
-    spread = MAD * float(np.median(np.abs(gap - np.median(gap))))
     return (
         f"v_left - v_right of {len(gap)} matches: mean {gap.mean():+.3f} px, an error of the rectification; robust sd "
-        f"{spread:.3f} px."
+        f"{robust_sd(gap):.3f} px."
     )

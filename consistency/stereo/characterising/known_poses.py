@@ -19,7 +19,16 @@ from consistency.stereo.characterising.characterise import (
     Coordinate,
     DisparityNoise,
 )
-from consistency.stereo.characterising.coordinate_fit import LAGS, Levels, moving_over_rest, rate, tails
+from consistency.stereo.characterising.coordinate_fit import (
+    FEWEST_PAIRS,
+    LAGS,
+    Levels,
+    interval_on_scale,
+    moving_over_rest,
+    rate,
+    tails,
+    wider,
+)
 from consistency.stereo.characterising.log_residuals import MARGIN, octaves, within_limits
 from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
 
@@ -28,10 +37,15 @@ FIXED = (
     "Landmarks are not known: each track's point was fitted. A bias map and constant offsets of tracks cannot be told "
     "from where the points are, so neither is estimated; what of a bias changes along a track counts as noise."
 )
+HIDDEN = "Where noise is correlated along a track, the fitted points take part of it: sigma is then a lower limit."
 
 
 def characterise_posed(
-    seen: Seen, sensor: PicturedSensor, source: str, notes: tuple[str, ...] = (), free_poses: bool = False
+    seen: Seen,
+    sensor: PicturedSensor,
+    source: str,
+    notes: tuple[str, ...] = (),
+    free_poses: bool = False,
 ) -> Characterisation:
     """Noise, growth, correlation and tails from tracks of unknown points.
 
@@ -46,33 +60,47 @@ def characterise_posed(
     assert sensor.B is not None
     total = len(seen.z)
     seen = seen.long_enough()
-    short = total - len(seen.z)
     _require_enough(seen, total, source)
-    fitted = fit_points(seen, sensor.f, sensor.B, _parts(len(seen.z)), np.ones(3), free_poses)
-    good = without_gross(fitted)
-    inside = within_limits(fitted.ideal, MARGIN * fitted.sigma, sensor)
+    first = fit_points(seen, sensor.f, sensor.B, coordinates_as_parts(seen), np.ones(3), free_poses)
+    good = without_gross(first)
+    inside = within_limits(first.ideal, MARGIN * first.sigma, sensor)
     kept = seen.keep(good & inside).long_enough()
     _require_enough(kept, total, source)
-    plain = fit_points(kept, sensor.f, sensor.B, _parts(len(kept.z)), fitted.sigma, free_poses)
-    nodes, by_disparity = _by_disparity(plain, sensor.f, sensor.B, free_poses)
-    levels = Levels(RATE, growth=len(nodes))
-    growth = None if by_disparity is None else _growth(nodes, by_disparity, levels)
-    of = by_disparity if growth is not None and growth.shown and by_disparity is not None else plain
-    wrong, limits = int((~good).sum()), int((good & ~inside).sum())
-    tracks = len(np.unique(kept.track))
-    u, v, d = (_coordinate(k, of, plain, levels) for k in range(3))
-    ratio = moving_over_rest(of.scaled, of.free, of.seen.moving, of.seen.track, levels.of("sigma"))
-    left_out = {"of tracks too short": short, "near a limit of the sensor": limits, "of tracks grossly wrong": wrong}
+    plain = fit_points(kept, sensor.f, sensor.B, coordinates_as_parts(kept), first.sigma, free_poses)
+    levels = Levels(RATE)
+    chosen = plain
+    growth = None
+    nodes, nearest = _disparity_nodes(plain)
+    if nearest is not None:
+        levels = Levels(RATE, growth=len(nodes))
+        by_disparity = _fit_by_disparity(plain, nearest, len(nodes), sensor.f, sensor.B, free_poses)
+        growth = _growth(nodes, by_disparity, levels)
+        if growth.shown:
+            chosen = by_disparity
+    u, v, d = (_coordinate(k, chosen, plain, levels) for k in range(3))
+    notes = (FIXED, *notes)
+    if any(coordinate.white is False for coordinate in (u, v, d)):
+        notes = (*notes, HIDDEN)
+    wrong = int((~good).sum())
     return Characterisation(
-        sensor, source, (u, v, d), growth, None, rate(wrong, len(good), levels.of("tails")), tracks, len(kept.z),
-        left_out, levels, of.residuals, (FIXED, *notes, *_hidden((u, v, d)), *_shared(of, free_poses)), ratio,
-    )  # fmt: skip
-
-
-def _hidden(coordinates: tuple[Coordinate, ...]) -> tuple[str, ...]:
-    if all(c.white is not False for c in coordinates):
-        return ()
-    return ("Where noise is correlated along a track, the fitted points take part of it: sigma is then a lower limit.",)
+        sensor,
+        source,
+        coordinates=(u, v, d),
+        growth=growth,
+        bias=None,
+        gross=rate(wrong, len(good), levels.of("tails")),
+        tracks=len(np.unique(kept.track)),
+        rows=len(kept.z),
+        left_out={
+            "of tracks too short": total - len(seen.z),
+            "near a limit of the sensor": int((good & ~inside).sum()),
+            "of tracks grossly wrong": wrong,
+        },
+        level=levels,
+        kept=chosen.residuals,
+        notes=(*notes, *_shared(chosen, free_poses)),
+        ratio=moving_over_rest(chosen.scaled, chosen.free, kept.moving, kept.track, levels.of("sigma")),
+    )
 
 
 def _require_enough(seen: Seen, total: int, source: str) -> None:
@@ -84,21 +112,27 @@ def _require_enough(seen: Seen, total: int, source: str) -> None:
         )
 
 
-def _parts(rows: int) -> Indices:
-    return np.tile(np.arange(3), (rows, 1))
+def coordinates_as_parts(seen: Seen) -> Indices:
+    """Components (N, 3) of a noise that each coordinate has one of."""
+    return np.tile(np.arange(3), (len(seen.z), 1))
 
 
-def _by_disparity(plain: Fitted, f: float, B: float, free_poses: bool) -> tuple[Array, Fitted | None]:
-    """Nodes of disparity, and the fit with a noise of its own around each; None with one node."""
+def _disparity_nodes(plain: Fitted) -> tuple[Array, Indices | None]:
+    """Nodes (m,) of disparity, and the nearest to each row (N,); None where the data are too few for two nodes."""
     d = np.maximum(plain.ideal[:, 2], 1e-3)
     nodes = octaves(d)
     nearest = hats(d, nodes).argmax(axis=1)
     if len(nodes) < 2 or np.bincount(nearest, minlength=len(nodes)).min() < LEAST_TRACKS:
-        return nodes[:1], None
-    parts = _parts(len(d))
+        return nodes, None
+    return nodes, nearest
+
+
+def _fit_by_disparity(plain: Fitted, nearest: Indices, nodes: int, f: float, B: float, free_poses: bool) -> Fitted:
+    """The fit in which the disparity has a noise of its own around each node."""
+    parts = coordinates_as_parts(plain.seen)
     parts[:, 2] += nearest
-    start = np.append(plain.sigma[:2], np.full(len(nodes), plain.sigma[2]))
-    return nodes, fit_points(plain.seen, f, B, parts, start, free_poses)
+    start = np.append(plain.sigma[:2], np.full(nodes, plain.sigma[2]))
+    return fit_points(plain.seen, f, B, parts, start, free_poses)
 
 
 def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[Interval, float]:
@@ -107,35 +141,47 @@ def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple
     The wider of two: chi-square with the degrees of freedom that are left, for Gaussian noise, and the scatter of the
     tracks' sums of squares, for any noise.
     """
-    excess = np.where(chosen, of.r**2 - sigma**2 * of.free, 0.0).sum(axis=1)
-    _, where = np.unique(of.seen.track, return_inverse=True)
     dof = float(of.free[chosen].sum())
-    of_tracks = np.bincount(where, excess)
-    tracks = int((np.bincount(where, chosen.any(axis=1)) > 0).sum())
-    model, robust = np.sqrt(0.5 / dof), 0.5 * np.sqrt((of_tracks**2).sum()) / (dof * sigma**2)
-    half = max(model * stats.norm.isf(level / 2), robust * stats.t.isf(level / 2, max(tracks - 1, 1)))
-    variance = max(model**2, robust**2)
-    return Interval(sigma, float(sigma * np.exp(-half)), float(sigma * np.exp(half))), float(variance)
+    excess = np.where(chosen, of.r**2 - sigma**2 * of.free, 0.0).sum(axis=1)
+    of_tracks = of.sums_of_tracks(excess)
+    tracks = np.count_nonzero(of.sums_of_tracks(chosen.any(axis=1)))
+    gaussian = np.sqrt(0.5 / dof)
+    any_noise = 0.5 * np.sqrt((of_tracks**2).sum()) / (dof * sigma**2)
+    half = float(wider(gaussian, any_noise, tracks, level))
+    interval = interval_on_scale(lambda log: sigma * np.exp(log), 0.0, half)
+    return interval, float(max(gaussian, any_noise) ** 2)
 
 
 def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
-    level = levels.of("growth")
-    pairs = [log_interval(of, of.parts == 2 + j, float(of.sigma[2 + j]), level) for j in range(len(nodes))]
-    logs, variances = np.log(of.sigma[2:]), np.array([variance for _, variance in pairs])
-    mean = (logs / variances).sum() / (1.0 / variances).sum()
-    p_value = float(stats.chi2.sf(((logs - mean) ** 2 / variances).sum(), len(nodes) - 1))
-    return DisparityNoise(nodes, tuple(estimate for estimate, _ in pairs), p_value, p_value < levels.rate / 6)
+    intervals = []
+    weights = np.empty(len(nodes))
+    for j in range(len(nodes)):
+        part = 2 + j
+        interval, variance = log_interval(of, of.parts == part, float(of.sigma[part]), levels.of("growth"))
+        intervals.append(interval)
+        weights[j] = 1.0 / variance
+    logs = np.log(of.sigma[2:])
+    mean = (logs * weights).sum() / weights.sum()
+    chi2 = ((logs - mean) ** 2 * weights).sum()
+    p_value = float(stats.chi2.sf(chi2, len(nodes) - 1))
+    return DisparityNoise(nodes, tuple(intervals), p_value, p_value < levels.rate / 6)
 
 
 def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate:
-    own = np.zeros(of.r.shape, bool)
-    own[:, k] = True
-    sigma = float(np.sqrt((of.r[:, k] ** 2).sum() / of.free[:, k].sum())) if of is plain else float(plain.sigma[k])
-    estimate, _ = log_interval(plain, own, sigma, levels.of("sigma"))
+    interval, _ = log_interval(plain, plain.parts == k, float(plain.sigma[k]), levels.of("sigma"))
     scaled = of.scaled[of.free[:, k] > FREE, k]
-    lags, bounds, interval = correlations(of, k, levels.of("correlation"))
+    lags, bounds, correlation = correlations(of, k, levels.of("correlation"))
     return Coordinate(
-        NAMES[k], estimate, np.nan, np.nan, interval, None, tails(scaled, levels.of("tails")), lags, bounds, scaled
+        NAMES[k],
+        sigma=interval,
+        pooled=np.nan,
+        about_tracks=np.nan,
+        correlation=correlation,
+        offset=None,
+        tails=tails(scaled, levels.of("tails")),
+        lags=lags,
+        bounds=bounds,
+        residuals=scaled,
     )
 
 
@@ -145,20 +191,23 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interv
     The fit of a point correlates the residuals of a track; what it does to neighbours is taken off. It also hides part
     of a true correlation in short tracks, so that values beyond lag 1 are drawn only for tracks that are long.
     """
-    seen, e = of.seen, of.r[:, k] / of.sigma[of.parts[:, k]]
-    given = of.neighbours[:, k] / of.sigma[of.parts[:, k]] ** 2
-    lags, bounds = np.full(LAGS, np.nan), np.full(LAGS, np.nan)
-    follows = np.append(False, (np.diff(seen.track) == 0) & (np.diff(seen.step) == 1))
-    pair = np.flatnonzero(follows)
-    if len(pair) < 20:
+    lags = np.full(LAGS, np.nan)
+    bounds = np.full(LAGS, np.nan)
+    seen = of.seen
+    pair = 1 + np.flatnonzero((np.diff(seen.track) == 0) & (np.diff(seen.step) == 1))
+    if len(pair) < FEWEST_PAIRS:
         return lags, bounds, None
-    products = e[pair] * e[pair - 1] - given[pair]
+    sigma = of.sigma[of.parts[:, k]]
+    e = of.r[:, k] / sigma
+    products = e[pair] * e[pair - 1] - (of.neighbours[:, k] / sigma**2)[pair]
     weight = np.sqrt(np.maximum(of.free[pair, k] * of.free[pair - 1, k], 0.0))
-    _, where = np.unique(seen.track[pair], return_inverse=True)
     value = float(products.sum() / weight.sum())
-    error = float(np.sqrt((np.bincount(where, products - value * weight) ** 2).sum()) / weight.sum())
+    _, where = np.unique(seen.track[pair], return_inverse=True)
+    of_tracks = np.bincount(where, products - value * weight)
+    error = float(np.sqrt((of_tracks**2).sum()) / weight.sum())
     half = error * float(stats.t.isf(level / 2, max(where.max(), 1)))
-    lags[0], bounds[0] = value, 1.96 * error
+    lags[0] = value
+    bounds[0] = 1.96 * error
     return lags, bounds, Interval(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
@@ -168,11 +217,15 @@ def _shared(of: Fitted, free_poses: bool) -> tuple[str, ...]:
     pairs = float((count * (count - 1)).sum())
     if pairs < 1 or len(count) < 3:
         return ()
-    texts = []
-    for k, name in enumerate(NAMES):
-        total, squares = np.bincount(where, of.r[:, k]), np.bincount(where, of.r[:, k] ** 2)
-        texts.append(f"{name} {np.sqrt(max(float((total**2 - squares).sum()) / pairs, 0.0)):.2g}")
-    if not any(float(text.split()[1]) for text in texts):
+    shared = np.zeros(3)
+    for k in range(3):
+        total = np.bincount(where, of.r[:, k])
+        squares = np.bincount(where, of.r[:, k] ** 2)
+        shared[k] = np.sqrt(max((total**2 - squares).sum() / pairs, 0.0))
+    if not shared.any():
         return ()
-    cause = "no pose explains it" if free_poses else "errors of the poses and shake of the rig"
-    return (f"Of the noise, what all landmarks of a step share has sd {', '.join(texts)} px: {cause}.",)
+    u, v, d = shared
+    cause = "errors of the poses and shake of the rig"
+    if free_poses:
+        cause = "no pose explains it"
+    return (f"Of the noise, what all landmarks of a step share has sd u {u:.2g}, v {v:.2g}, d {d:.2g} px: {cause}.",)

@@ -7,7 +7,6 @@ maximise the likelihood of what the regression leaves, so that the degrees of fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +17,7 @@ from consistency.referee.types import Array, Indices
 STEP = 1e-3  # of a parameter, for second differences; log sigma, atanh rho and log(1 + n q) are all of order 1
 MOST = 0.995  # magnitude of a correlation
 IMPOSSIBLE = 1e12
+UNDETERMINED = "the data do not determine the noise"
 GENTLE = 1e-3  # of the rows: slope at which the first search ends
 STEPS = 30
 NEAR = 1e-6  # squared distance to the top, in standard deviations
@@ -49,16 +49,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class Parameters:
-    """What a vector of unconstrained parameters stands for."""
+    """Noise of one coordinate."""
 
     a: Array  # (m,), px, standard deviation of the noise at the nodes
     rho: float
     ratio: float  # q: variance of the offsets over that of the noise; may be a little below 0
-
-    @classmethod
-    def of(cls, theta: Array, length: float) -> Parameters:
-        """From log a, atanh rho, log(1 + length q): scales on which estimates are nearly Gaussian."""
-        return cls(np.exp(theta[:-2]), float(np.tanh(theta[-2])), float(np.expm1(theta[-1]) / length))
 
 
 @dataclass(frozen=True)
@@ -110,7 +105,8 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
     white = whiten_rows(rows, np.column_stack([rows.r, rows.X]), p)
     if white is None:
         return None
-    y, X = white.values[:, 0], white.values[:, 1:]
+    y = white.values[:, 0]
+    X = white.values[:, 1:]
     normal = X.T @ X + np.diag(rows.ridge)
     try:
         factor = np.linalg.cholesky(normal)
@@ -138,6 +134,43 @@ class LikelihoodFit:
         return len(self.rows.first)
 
 
+@dataclass(frozen=True)
+class Likelihood:
+    """Likelihood of rows over log a, atanh rho and log(1 + n q), on which estimates are nearly Gaussian."""
+
+    rows: Rows
+    memory: bool  # whether atanh rho and log(1 + n q) are parameters; if not, rho and q are 0
+
+    def parameters(self, x: Array) -> Parameters:
+        """The noise that ``x`` (k,) stands for."""
+        nodes = self.rows.G.shape[1]
+        if not self.memory:
+            return Parameters(np.exp(x), 0.0, 0.0)
+        rho = float(np.tanh(x[nodes]))
+        ratio = float(np.expm1(x[nodes + 1]) / max(self.rows.length, 1.0))
+        return Parameters(np.exp(x[:nodes]), rho, ratio)
+
+    def restricted(self, x: Array) -> float:
+        """Negative restricted log-likelihood."""
+        found = regress(self.rows, self.parameters(x))
+        if found is None:
+            return IMPOSSIBLE
+        return -found.value
+
+    def with_bias_held(self, x: Array, r: Array) -> float:
+        """Negative log-likelihood of residuals (N, 1) about a bias that is held, which costs much less."""
+        white = whiten_rows(self.rows, r, self.parameters(x))
+        if white is None:
+            return IMPOSSIBLE
+        return 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
+
+    def of_tracks(self, x: Array, r: Array) -> Array:
+        """Log-likelihood (K,) of the residuals (N, 1) of each track, likewise."""
+        white = whiten_rows(self.rows, r, self.parameters(x))
+        assert white is not None
+        return -0.5 * (white.log_variance + np.add.reduceat(white.values[:, 0] ** 2, self.rows.first))
+
+
 def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     """The parameters of largest restricted likelihood.
 
@@ -151,93 +184,79 @@ def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     ValueError
         The rows do not determine the parameters.
     """
-    m, length = rows.G.shape[1], max(rows.length, 1.0)
-    free = np.arange(m + 2 if memory else m)
-    theta = np.concatenate([np.full(m, np.log(start)), [0.0, 0.0]])
-
-    def full(values: Array) -> Array:
-        out = theta.copy()
-        out[free] = values
-        return out
-
-    def restricted(values: Array) -> float:
-        found = regress(rows, Parameters.of(full(values), length))
-        return IMPOSSIBLE if found is None else -found.value
-
-    x = np.asarray(theta[free])
-    plain = rows.X @ np.linalg.solve(rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9), rows.X.T @ rows.r)
-    x = optimize.minimize(_held(rows, plain, full, length), x, method="BFGS", options={"gtol": GENTLE * len(rows.r)}).x
-    x, H = _climb(restricted, x, rows, full, length)
-    theta = full(x)
-    parameters = Parameters.of(theta, length)
-    regression = regress(rows, parameters)
+    likelihood = Likelihood(rows, memory)
+    nodes = rows.G.shape[1]
+    x = np.zeros(nodes + 2 * memory)
+    x[:nodes] = np.log(start)
+    normal = rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9)
+    about_plain = rows.r - rows.X @ np.linalg.solve(normal, rows.X.T @ rows.r)
+    options = {"gtol": GENTLE * len(rows.r)}
+    first = optimize.minimize(likelihood.with_bias_held, x, (about_plain[:, None],), method="BFGS", options=options)
+    x, H = _climb(likelihood, first.x)
+    regression = regress(rows, likelihood.parameters(x))
     if regression is None:
-        raise ValueError("the data do not determine the noise")
+        raise ValueError(UNDETERMINED)
     inverse = np.linalg.inv(H)
-    scores = _scores(rows, full, x, regression.beta, length)
+    scores = _scores(likelihood, x, regression.beta)
     K = len(scores)
     robust = inverse @ (scores.T @ scores) @ inverse * K / max(K - 1, 1)
-    cov, scatter = np.zeros((m + 2, m + 2)), np.zeros((m + 2, m + 2))
-    cov[np.ix_(free, free)], scatter[np.ix_(free, free)] = inverse, robust
-    return LikelihoodFit(rows, theta, cov, scatter, regression, parameters)
+    missing = nodes + 2 - len(x)
+    return LikelihoodFit(
+        rows,
+        theta=np.pad(x, (0, missing)),
+        cov=np.pad(inverse, (0, missing)),
+        robust=np.pad(robust, (0, missing)),
+        regression=regression,
+        parameters=likelihood.parameters(x),
+    )
 
 
-def _held(rows: Rows, bias: Array, full: Callable[[Array], Array], length: float) -> Callable[[Array], float]:
-    """Negative log-likelihood of the free parameters with the bias (N,) held, much cheaper than the restricted one."""
-    y = (rows.r - bias)[:, None]
-
-    def negative(values: Array) -> float:
-        white = whiten_rows(rows, y, Parameters.of(full(values), length))
-        return IMPOSSIBLE if white is None else 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
-
-    return negative
-
-
-def _climb(
-    restricted: Callable[[Array], float], x: Array, rows: Rows, full: Callable[[Array], Array], length: float
-) -> tuple[Array, Array]:
-    """Newton's steps to the least ``restricted``, and the curvature there.
+def _climb(likelihood: Likelihood, x: Array) -> tuple[Array, Array]:
+    """Newton's steps to the largest restricted likelihood, and the curvature there.
 
     The curvature is that with the bias held: its residuals have lost already the degrees of freedom that it costs.
     """
-    e = STEP * np.eye(len(x))
+    rows = likelihood.rows
     for _ in range(STEPS):
-        found = regress(rows, Parameters.of(full(x), length))
+        found = regress(rows, likelihood.parameters(x))
         if found is None:
-            raise ValueError("the data do not determine the noise")
-        H = numerical_hessian(_held(rows, rows.X @ found.beta, full, length), x)
+            raise ValueError(UNDETERMINED)
+        H = _curvature(likelihood, x, found.beta)
         if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
-            raise ValueError("the data do not determine the noise")
-        slope = np.array([(restricted(x + d) - restricted(x - d)) / (2.0 * STEP) for d in e])
-        step, size = -np.linalg.solve(H, slope), 1.0
+            raise ValueError(UNDETERMINED)
+        slope = np.empty(len(x))
+        for i, d in enumerate(STEP * np.eye(len(x))):
+            slope[i] = (likelihood.restricted(x + d) - likelihood.restricted(x - d)) / (2.0 * STEP)
+        step = -np.linalg.solve(H, slope)
         if slope @ -step < NEAR:
             return x, H
-        while restricted(x + size * step) > -found.value and size > 1e-3:
+        size = 1.0
+        while likelihood.restricted(x + size * step) > -found.value and size > 1e-3:
             size *= 0.5
         x = x + size * step
     return x, H
 
 
-def numerical_hessian(objective: Callable[[Array], float], x: Array) -> Array:
-    """Second derivatives (k, k) by central differences."""
-    k, e = len(x), STEP * np.eye(len(x))
-    H = np.empty((k, k))
-    for i in range(k):
-        for j in range(i + 1):
-            values = [objective(x + s * e[i] + t * e[j]) for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-            H[i, j] = H[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * STEP**2)
+def _curvature(likelihood: Likelihood, x: Array, beta: Array) -> Array:
+    """Second derivatives (k, k) of the negative log-likelihood, by central differences."""
+    r = (likelihood.rows.r - likelihood.rows.X @ beta)[:, None]
+    e = STEP * np.eye(len(x))
+    H = np.empty((len(x), len(x)))
+    for i, j in zip(*np.tril_indices(len(x)), strict=True):
+        both_up = likelihood.with_bias_held(x + e[i] + e[j], r)
+        one_up = likelihood.with_bias_held(x + e[i] - e[j], r)
+        other_up = likelihood.with_bias_held(x - e[i] + e[j], r)
+        both_down = likelihood.with_bias_held(x - e[i] - e[j], r)
+        H[i, j] = (both_up - one_up - other_up + both_down) / (4.0 * STEP**2)
+        H[j, i] = H[i, j]
     return H
 
 
-def _scores(rows: Rows, full: Callable[[Array], Array], x: Array, beta: Array, length: float) -> Array:
+def _scores(likelihood: Likelihood, x: Array, beta: Array) -> Array:
     """Derivative of each track's log-likelihood by each parameter, (K, k), with the bias held."""
-    y = (rows.r - rows.X @ beta)[:, None]
-
-    def by_track(values: Array) -> Array:
-        white = whiten_rows(rows, y, Parameters.of(full(values), length))
-        assert white is not None
-        return -0.5 * (white.log_variance + np.add.reduceat(white.values[:, 0] ** 2, rows.first))
-
-    columns = [(by_track(x + d) - by_track(x - d)) / (2.0 * STEP) for d in STEP * np.eye(len(x))]
-    scores = np.column_stack(columns)
-    return np.asarray(scores - scores.mean(axis=0))
+    rows = likelihood.rows
+    r = (rows.r - rows.X @ beta)[:, None]
+    scores = np.empty((len(rows.first), len(x)))
+    for i, d in enumerate(STEP * np.eye(len(x))):
+        scores[:, i] = (likelihood.of_tracks(x + d, r) - likelihood.of_tracks(x - d, r)) / (2.0 * STEP)
+    return scores - scores.mean(axis=0)

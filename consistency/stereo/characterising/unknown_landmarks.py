@@ -9,7 +9,7 @@ leverage of each observation in the fit of its point.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,7 +62,12 @@ class Fitted:
     @property
     def scaled(self) -> Array:
         """Residuals over their standard deviations, (N, 3)."""
-        return np.asarray(self.r / (self.sigma[self.parts] * np.sqrt(np.maximum(self.free, 1e-9))))
+        return self.r / (self.sigma[self.parts] * np.sqrt(np.maximum(self.free, 1e-9)))
+
+    def sums_of_tracks(self, values: Array) -> Array:
+        """Sums (K,) of values (N,) over the rows of each track."""
+        _, where = np.unique(self.seen.track, return_inverse=True)
+        return np.bincount(where, values)
 
     @property
     def residuals(self) -> Residuals:
@@ -70,7 +75,14 @@ class Fitted:
         return Residuals(self.r, self.ideal, self.seen.track, self.seen.step, self.seen.moving)
 
 
-def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, free_poses: bool = False) -> Fitted:
+def fit_points(
+    seen: Seen,
+    f: float,
+    B: float,
+    parts: Indices,
+    start: Array,
+    free_poses: bool = False,
+) -> Fitted:
     """Fit the point of each track and the noise of each component, in turns until both stay.
 
     Parameters
@@ -79,25 +91,33 @@ def fit_points(seen: Seen, f: float, B: float, parts: Indices, start: Array, fre
     start : (components,), px, first guess of the noise
     free_poses : whether the pose of each step is fitted too, six values each, from the one that is given
     """
-    sigma, points = np.asarray(start, float), _first_points(seen, f, B)
+    sigma = np.asarray(start, float)
+    points = _first_points(seen, f, B)
     groups = list(_groups(seen))
-    steps, at = np.unique(seen.step, return_inverse=True)
-    r, free, neighbours = (np.zeros(seen.z.shape) for _ in range(3))
+    steps, step_of_row = np.unique(seen.step, return_inverse=True)
+    steps_of_groups = [step_of_row[rows] for _, rows in groups]
+    r = np.zeros(seen.z.shape)
+    free = np.zeros(seen.z.shape)
+    neighbours = np.zeros(seen.z.shape)
     for _ in range(ROUNDS):
         s = sigma[parts]
-        slopes = [slopes_of(seen.z[k], seen.R[k], seen.t[k], points[t], f, B, s[k]) for t, k in groups]
+        slopes = []
+        for tracks, rows in groups:
+            slopes.append(slopes_of(seen.z[rows], seen.R[rows], seen.t[rows], points[tracks], f, B, s[rows]))
         if free_poses:
-            done, moves = steps_of_both(
-                [(each, at[k]) for each, (_, k) in zip(slopes, groups, strict=True)], len(steps)
-            )
-            seen = _moved(seen, moves[at])
+            done, moves = steps_of_both(slopes, steps_of_groups, len(steps))
+            seen = _moved(seen, moves[step_of_row])
         else:
-            done = [step_of_points(each) for each in slopes]
+            done = list(map(step_of_points, slopes))
         for (tracks, rows), step in zip(groups, done, strict=True):
             points[tracks] += step.points
-            r[rows], free[rows], neighbours[rows] = step.r * s[rows], step.free, step.neighbours
+            r[rows] = step.r * s[rows]
+            free[rows] = step.free
+            neighbours[rows] = step.neighbours
         neighbours[1:] *= s[1:] * s[:-1]
-        new = np.sqrt(np.bincount(parts.ravel(), (r**2).ravel()) / np.bincount(parts.ravel(), free.ravel()))
+        squares = np.bincount(parts.ravel(), (r**2).ravel())
+        dof = np.bincount(parts.ravel(), free.ravel())
+        new = np.sqrt(squares / dof)
         change = np.abs(new / sigma - 1.0).max()
         sigma = np.maximum(new, 1e-9)
         if change < SETTLED:
@@ -114,18 +134,20 @@ def _moved(seen: Seen, moves: Array) -> Seen:
 def without_gross(fitted: Fitted) -> Array:
     """Rows (N,) of tracks whose residuals are all within ``GROSS`` robust standard deviations of their component."""
     scaled = np.abs(fitted.r / np.sqrt(np.maximum(fitted.free, 0.05)))
-    limit = np.array([MAD * np.median(scaled[fitted.parts == k]) for k in range(len(fitted.sigma))]) * GROSS
+    limit = np.empty(len(fitted.sigma))
+    for k in range(len(limit)):
+        limit[k] = MAD * np.median(scaled[fitted.parts == k]) * GROSS
     wrong = (scaled > limit[fitted.parts]).any(axis=1)
-    return np.asarray(~np.isin(fitted.seen.track, fitted.seen.track[wrong]))
+    return ~np.isin(fitted.seen.track, fitted.seen.track[wrong])
 
 
 def _first_points(seen: Seen, f: float, B: float) -> Array:
     """Points (tracks, 3) from the nearest observation of each, m in the world."""
-    _, where = np.unique(seen.track, return_inverse=True)
-    best = np.lexsort((-seen.z[:, 2], where))[np.cumsum(np.append(0, np.bincount(where)[:-1]))]
+    _, first = np.unique(seen.track, return_index=True)
+    best = np.lexsort((-seen.z[:, 2], seen.track))[first]
     u, v, d = seen.z[best].T
     local = np.stack(stereo.triangulate(u, v, d, f, B), axis=-1)
-    return np.asarray(np.einsum("nij,nj->ni", seen.R[best], local) + seen.t[best])
+    return np.einsum("nij,nj->ni", seen.R[best], local) + seen.t[best]
 
 
 def _groups(seen: Seen) -> Iterator[tuple[Indices, Indices]]:
@@ -145,15 +167,27 @@ class Slopes:
     by_pose: Array  # (T, n, 3, 6)
     cov: Array  # (T, 3, 3), of the point if the poses are right
 
+    @property
+    def pose_by_point(self) -> Array:
+        """Mixed second derivatives of the cost, (T, n, 6, 3)."""
+        return np.einsum("tnci,tncj->tnij", self.by_pose, self.by_point)
 
-def slopes_of(z: Array, R: Array, t: Array, points: Array, f: float, B: float, sigma: Array) -> Slopes:
+
+def slopes_of(
+    z: Array,
+    R: Array,
+    t: Array,
+    points: Array,
+    f: float,
+    B: float,
+    sigma: Array,
+) -> Slopes:
     """Slopes at points (T, 3) seen as ``z`` (T, n, 3) from poses (T, n, 3, 3), (T, n, 3), with noise (T, n, 3)."""
     x, y, w = np.moveaxis(np.einsum("tnji,tnj->tni", R, points[:, None] - t), -1, 0)
     x = np.maximum(x, NEAREST)
     predicted = np.stack(stereo.project(x, y, w, f, B), axis=-1)
     zero = np.zeros_like(x)
-    entries = [entry + zero for entry in stereo.project_jacobian(x, y, w, f, B)]
-    J = np.stack(entries, axis=-1).reshape(*x.shape, 3, 3) / sigma[..., None]
+    J = np.stack(stereo.project_jacobian(x, y, w, f, B), axis=-1).reshape(*x.shape, 3, 3) / sigma[..., None]
     by_point = J @ np.swapaxes(R, -1, -2)
     turned = np.stack([zero, -w, y, w, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
     by_pose = np.concatenate([-J, J @ turned], axis=-1)
@@ -181,39 +215,46 @@ def step_of_points(s: Slopes) -> Step:
     return Step(move, r, free, neighbours)
 
 
-def steps_of_both(groups: Sequence[tuple[Slopes, Indices]], steps: int) -> tuple[list[Step], Array]:
+def steps_of_both(slopes: list[Slopes], at: list[Indices], steps: int) -> tuple[list[Step], Array]:
     """The step of all points and of all poses.
 
     Parameters
     ----------
-    groups : slopes of tracks of one length, and the number 0, 1, ... of the step of each observation, (T, n)
+    slopes : of tracks of one length each
+    at : for each of these the number 0, 1, ... of the step of each observation, (T, n)
     steps : number of poses
 
     Returns
     -------
     steps of the points, and the moves (steps, 6) of the poses
     """
-    N, g = np.zeros((steps, steps, POSE, POSE)), np.zeros((steps, POSE))
-    for s, at in groups:
-        W = np.einsum("tnci,tncj->tnij", s.by_pose, s.by_point)  # (T, n, 6, 3)
+    N = np.zeros((steps, steps, POSE, POSE))
+    g = np.zeros((steps, POSE))
+    for s, own in zip(slopes, at, strict=True):
+        W = s.pose_by_point
         pull = np.einsum("tij,tncj,tnc->ti", s.cov, s.by_point, s.r)
-        np.add.at(g, at, np.einsum("tnci,tnc->tni", s.by_pose, s.r) - np.einsum("tnij,tj->tni", W, pull))
-        np.add.at(N, (at, at), np.einsum("tnci,tncj->tnij", s.by_pose, s.by_pose))
-        np.add.at(N, (at[:, :, None], at[:, None, :]), -np.einsum("tnij,tjk,tmlk->tnmil", W, s.cov, W))
+        np.add.at(g, own, np.einsum("tnci,tnc->tni", s.by_pose, s.r) - np.einsum("tnij,tj->tni", W, pull))
+        np.add.at(N, (own, own), np.einsum("tnci,tncj->tnij", s.by_pose, s.by_pose))
+        np.add.at(N, (own[:, :, None], own[:, None, :]), -np.einsum("tnij,tjk,tmlk->tnmil", W, s.cov, W))
     Q = _inverse(N.swapaxes(1, 2).reshape(steps * POSE, -1)).reshape(steps, POSE, steps, POSE)
     moves = np.einsum("siuj,uj->si", Q, g)
-    return [_step(s, at, Q, moves) for s, at in groups], moves
+    return [_step(s, own, Q, moves) for s, own in zip(slopes, at, strict=True)], moves
 
 
 def _inverse(N: Array) -> Array:
     """Inverse on all but the six directions in which poses and points move together, which no observation tells."""
     values, axes = np.linalg.eigh(N)
-    return np.asarray((axes[:, POSE:] / values[POSE:]) @ axes[:, POSE:].T)
+    return (axes[:, POSE:] / values[POSE:]) @ axes[:, POSE:].T
 
 
-def _step(s: Slopes, at: Indices, Q: Array, moves: Array) -> Step:
+def _step(
+    s: Slopes,
+    at: Indices,
+    Q: Array,
+    moves: Array,
+) -> Step:
     held = step_of_points(s)
-    W = np.einsum("tnci,tncj->tnij", s.by_pose, s.by_point)
+    W = s.pose_by_point
     mine = moves[at]  # (T, n, 6)
     points = held.points - np.einsum("tij,tnkj,tnk->ti", s.cov, W, mine)
     r = s.r - np.einsum("tnci,ti->tnc", s.by_point, points) - np.einsum("tnci,tni->tnc", s.by_pose, mine)

@@ -16,18 +16,16 @@ from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
-from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular
+from consistency.stereo.visual_odometry.relative_pose import angular, euler_angles
 from consistency.stereo.visual_odometry.sequence import Sequence
 from consistency.stereo.visual_odometry.tracks import PIXELS, TrackSelection, linked, thinned
 
-MAX_AGE, MIN_LIFE, BANDS = (
-    12,
-    2,
-    3,
-)  # observations of a landmark at most and at least, columns: as docs/reference/recorded.md
+MAX_AGE = 12  # observations of a landmark, at most, as docs/reference/recorded.md
+MIN_LIFE = 2  # at least
+BANDS = 3  # columns of the image that landmarks are spread over
 NEAR = 10.0  # standard deviations of its disparity that a landmark has at least: its range is nearly Gaussian
 MOST_SLOTS = 64  # landmarks at once
 # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
@@ -61,7 +59,8 @@ class Plane:
     @property
     def line(self) -> str:
         """What leaves the plane, and by how much."""
-        (u, v, d), limits = self.sigma, ", ".join(f"{value:.0f}" for value in self.limit)
+        u, v, d = self.sigma
+        limits = ", ".join(f"{value:.0f}" for value in self.limit)
         tilts = np.rad2deg(self.tilts)
         return (
             f"seen along a plane, landmarks are off by {u:.0f}, {v:.0f}, {d:.0f} px in u, v, d, and a tenth of their "
@@ -71,16 +70,21 @@ class Plane:
 
     @property
     def fields(self) -> dict[str, object]:
+        """What a manifest says of it."""
         tilts = np.rad2deg(self.tilts)
         return {
-            "holds": self.holds, "sigma_px": self.sigma, "limit_px": self.limit, "motions": len(tilts),
-            "leaving": self.leaving, "tilt_deg": {"median": float(np.median(tilts)), "most": float(tilts.max())},
-        }  # fmt: skip
+            "holds": self.holds,
+            "sigma_px": self.sigma,
+            "limit_px": self.limit,
+            "motions": len(tilts),
+            "leaving": self.leaving,
+            "tilt_deg": {"median": float(np.median(tilts)), "most": float(tilts.max())},
+        }
 
 
 def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Plane:
     """What of ``motions`` the planar log that :func:`log_of` makes of them leaves out."""
-    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
+    R, t = stacked(motions)
     turn, _ = in_robot_axes(R, t, robot_axes(t), 0.0)
     tilts = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()[:, :2], axis=1)
     sensor = belief.sensor
@@ -88,6 +92,11 @@ def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Pla
     u, v, d = sensor.sigma
     wide = sensor.f / NEAR
     return Plane((u, v, d), (wide, wide, float(np.median(trial.z[:, 2])) / NEAR), tilts)
+
+
+def stacked(motions: list[RelativeMotion]) -> tuple[Array, Array]:
+    """Rotations (T, 3, 3) and translations (T, 3) of motions, m."""
+    return np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
 
 
 def log_of(
@@ -112,11 +121,12 @@ def log_of(
     InputError
         No track can be used, or too few landmarks are allowed.
     """
-    rig, dt = sequence.rectification.rig, np.diff(sequence.t)
-    R, t = np.array([m.pose.R for m in motions]), np.array([m.pose.t for m in motions])
+    rig = sequence.rectification.rig
+    dt = np.diff(sequence.t)
+    R, t = stacked(motions)
     axes = robot_axes(t)
     moves = planar_motions(*in_robot_axes(R, t, axes, lever))
-    mount = Mount(position=(lever, 0.0, 0.0), rotation=tuple(map(float, RelativePose(axes @ CAMERA, np.zeros(3)).rpy)))
+    mount = Mount(position=(lever, 0.0, 0.0), rotation=tuple(euler_angles(axes @ CAMERA).tolist()))
     seen = selected(observations(rig, motions), max_landmarks, rig.image_size[0])
     sigma = misfit(seen, planar_path(moves), mount, rig)
     true_path = None
@@ -143,17 +153,29 @@ def observations(rig: StereoRig, motions: list[RelativeMotion]) -> pd.DataFrame:
     A track is a chain of inliers of the motions: where one is an outlier it ends, and another landmark begins.
     """
     pieces = linked([m.rows[m.inliers] for m in motions])
-    parts, known = [], set[int]()
+    parts = []
+    tracks = 0
     for step, (m, piece) in enumerate(zip(motions, pieces, strict=True), start=1):
-        new = np.array([p not in known for p in piece.tolist()], bool)
-        known.update(piece.tolist())
-        for at, uv, sigma, keep in ((step - 1, m.uv0, m.sigma0, new), (step, m.uv1, m.sigma1, np.full(len(new), True))):
-            uv, sigma = uv[m.inliers][keep], sigma[m.inliers][keep]
-            u, v = uv[:, 0] - rig.K_left[0, 2], uv[:, 1] - rig.K_left[1, 2]
-            d = u - (uv[:, 2] - rig.K_right[0, 2])
-            columns = {"piece": piece[keep], "z0": u, "z1": v, "z2": d, "sigma": np.hypot(sigma[:, 0], sigma[:, 2])}
-            parts.append(pd.DataFrame(columns).assign(step=at))
-    return pd.concat(parts, ignore_index=True).sort_values(["piece", "step"], ignore_index=True)
+        new = piece >= tracks  # tracks are numbered in the order in which they begin
+        tracks += np.count_nonzero(new)
+        parts.append(_sights(rig, m.uv0[m.inliers], m.sigma0[m.inliers], piece, step - 1)[new])
+        parts.append(_sights(rig, m.uv1[m.inliers], m.sigma1[m.inliers], piece, step))
+    return pd.concat(parts).sort_values(["piece", "step"], ignore_index=True)
+
+
+def _sights(rig: StereoRig, uv: Array, sigma: Array, piece: Indices, step: int) -> pd.DataFrame:
+    """Rows of one step from pixels (N, 4) of tracks and their standard deviations, px."""
+    u = uv[:, 0] - rig.K_left[0, 2]
+    return pd.DataFrame(
+        {
+            "piece": piece,
+            "z0": u,
+            "z1": uv[:, 1] - rig.K_left[1, 2],
+            "z2": u - (uv[:, 2] - rig.K_right[0, 2]),
+            "sigma": np.hypot(sigma[:, 0], sigma[:, 2]),
+            "step": step,
+        }
+    )
 
 
 def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
@@ -172,39 +194,47 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
     def selection_of(slots: int) -> pd.DataFrame:
         return thinned(rows, TrackSelection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
 
-    low, high, best = 1, MOST_SLOTS, selection_of(1)
+    low = 1
+    high = MOST_SLOTS
+    best = selection_of(1)
     if (fewest := best["landmark"].nunique()) > most:
         raise InputError(f"--max-landmarks {most}: one landmark at once makes {fewest} over the sequence; allow more")
     while low < high:  # the largest number at once
         middle = (low + high + 1) // 2
         table = selection_of(middle)
         if table["landmark"].nunique() <= most:
-            low, best = middle, table
+            low = middle
+            best = table
         else:
             high = middle - 1
     return best
 
 
-def misfit(seen: pd.DataFrame, path: Array, mount: Mount, rig: StereoRig) -> tuple[float, float, float]:
+def misfit(
+    seen: pd.DataFrame,
+    path: Array,
+    mount: Mount,
+    rig: StereoRig,
+) -> tuple[float, float, float]:
     """Root mean square of u, v, d (px) about landmarks placed by their nearest sight along the planar path.
 
     ``path`` is (T + 1, 3). The misfit holds the noise of the pixels and what the plane leaves out, roll and pitch above
     all. No truth is used.
     """
-    f, B, packed = float(rig.K_left[0, 0]), rig.baseline, mount.packed()
+    f = float(rig.K_left[0, 0])
+    B = rig.baseline
+    packed = mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
-    x, y, heading = path[nearest["step"]].T
-    u, v, d = nearest[PIXELS].to_numpy(float).T
-    place = np.column_stack(
-        point.to_world(x, y, heading, *point.from_sensor(*stereo.triangulate(u, v, d, f, B), packed))
-    )
+    in_sensor = stereo.triangulate(*nearest[PIXELS].to_numpy(float).T, f, B)
+    in_robot = point.from_sensor(*in_sensor, packed)
+    places = np.column_stack(point.to_world(*path[nearest["step"]].T, *in_robot))
     others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
-    x, y, heading = path[others["step"]].T
-    target = place[nearest.index.get_indexer(others["landmark"])].T
-    back = point.to_sensor(*point.to_robot(x, y, heading, *target), packed)
-    error = others[PIXELS].to_numpy(float) - np.column_stack(stereo.project(*back, f, B))
-    rms = np.sqrt(np.mean(error**2, axis=0))
-    return float(rms[0]), float(rms[1]), float(rms[2])
+    targets = places[nearest.index.get_indexer(others["landmark"])]
+    in_robot = point.to_robot(*path[others["step"]].T, *targets.T)
+    expected = stereo.project(*point.to_sensor(*in_robot, packed), f, B)
+    error = others[PIXELS].to_numpy(float) - np.column_stack(expected)
+    u, v, d = np.sqrt(np.mean(error**2, axis=0)).tolist()
+    return u, v, d
 
 
 def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> BelievedMotion:
@@ -216,10 +246,12 @@ def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> Bel
     dt : (T,), duration of each motion, s
     """
     forward, _, up = axes
-    along = [forward @ m.covariance[:3, :3] @ forward for m in motions]
-    turn = [up @ angular(m.pose) for m in motions]
-    about = [row @ m.covariance[3:, 3:] @ row for row, m in zip(turn, motions, strict=True)]
-    sigma_v, sigma_omega = (float(np.sqrt(np.mean(np.array(variance) / dt**2))) for variance in (along, about))
+    variances = np.empty((len(motions), 2))
+    for k, motion in enumerate(motions):
+        about = up @ angular(motion.pose)
+        variances[k, 0] = forward @ motion.covariance[:3, :3] @ forward
+        variances[k, 1] = about @ motion.covariance[3:, 3:] @ about
+    sigma_v, sigma_omega = np.sqrt(np.mean(variances / dt[:, None] ** 2, axis=0)).tolist()
     return BelievedMotion(sigma_v=sigma_v, sigma_omega=sigma_omega)
 
 
@@ -241,15 +273,23 @@ def robot_axes(t: Array) -> Array:
     t : (T, 3), translations from frame to frame in camera axes, m
     """
     total = t.sum(axis=0)
-    forward = total * np.where(total[2] < 0.0, -1.0, 1.0) / max(float(np.linalg.norm(total)), 1e-12)
-    if np.linalg.norm(total) < MOVED or forward[2] < np.cos(np.deg2rad(WITHIN)):
+    length = np.linalg.norm(total)
+    forward = total / max(length, 1e-12)
+    if forward[2] < 0.0:
+        forward = -forward
+    if length < MOVED or forward[2] < np.cos(np.deg2rad(WITHIN)):
         return CAMERA.T.copy()
     left = np.cross([0.0, -1.0, 0.0], forward)
     left /= np.linalg.norm(left)
     return np.array([forward, left, np.cross(forward, left)])
 
 
-def in_robot_axes(R: Array, t: Array, axes: Array, lever: float) -> tuple[Array, Array]:
+def in_robot_axes(
+    R: Array,
+    t: Array,
+    axes: Array,
+    lever: float,
+) -> tuple[Array, Array]:
     """Motions (T, 3, 3), (T, 3) of the camera as those of a robot point ``lever`` m behind it, in robot axes."""
     ahead = np.array([lever, 0.0, 0.0])
     turn = axes @ R @ axes.T
@@ -266,9 +306,9 @@ def planar_motions(R: Array, t: Array) -> Array:
 
 def planar_path(motions: Array) -> Array:
     """Poses x, y, heading (T + 1, 3) from :func:`planar_motions`, from the origin on; the heading is not wrapped."""
-    ones = np.ones(len(motions))
-    along = dead_reckoning(np.zeros(3), np.column_stack([ones, motions[:, 0], motions[:, 2]]))
-    heading = along[:-1, 2]
-    aside = np.cumsum(motions[:, 1:2] * np.column_stack([-np.sin(heading), np.cos(heading)]), axis=0)
-    along[1:, :2] += aside
-    return along
+    forward, left, turn = motions.T
+    path = dead_reckoning(np.zeros(3), np.column_stack([np.ones(len(motions)), forward, turn]))
+    heading = path[:-1, 2]
+    path[1:, 0] -= np.cumsum(left * np.sin(heading))
+    path[1:, 1] += np.cumsum(left * np.cos(heading))
+    return path

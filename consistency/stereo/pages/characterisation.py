@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
 from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
 from consistency.referee.pages.origin import facts
@@ -21,8 +22,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
-MEASURED, NORMAL, STUDENT = Look(COLOURS[0]), Look("#333333"), Look(COLOURS[1], (5.0, 2.0))
+MEASURED = Look(COLOURS[0])
+NORMAL = Look("#333333")
+STUDENT = Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)
+HEADS = ("Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
 REACH = 5.0  # standard deviations of the distribution that are drawn
 BINS = 60
 LOCALLY = 20  # groups of equal size in which a standard deviation is drawn
@@ -44,15 +48,22 @@ def compose_sensor(of: Characterisation, manifest: Mapping[str, Any]) -> Documen
 
 
 def _estimates(of: Characterisation) -> Table:
-    heads = ("Coordinate", "Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
-    columns = tuple(Column(head, number=i > 0) for i, head in enumerate(heads))
     rows: list[tuple[Cell, ...]] = []
     for c in of.coordinates:
-        texts = ("–" if e is None else interval(e, 2) for e in (c.correlation, c.offset, c.tails.weight))
-        pooled = f"{c.pooled:.3g}" if np.isfinite(c.pooled) else "–"
-        rows.append((c.name, interval(c.sigma, 3), *texts, f"{c.tails.excess_kurtosis:.2f}", pooled))
+        shares = map(_or_dash, (c.correlation, c.offset, c.tails.weight))
+        pooled = "–"
+        if np.isfinite(c.pooled):
+            pooled = f"{c.pooled:.3g}"
+        rows.append((c.name, interval(c.sigma, 3), *shares, f"{c.tails.excess_kurtosis:.2f}", pooled))
     caption = f"Intervals hold together with {100 * (1 - of.level.rate):g} %; 1/nu is 0 for a Gaussian noise."
-    return table(columns, rows, "Estimates of the sensor", caption=caption)
+    columns = [Column("Coordinate"), *(Column(head, number=True) for head in HEADS)]
+    return table(tuple(columns), rows, "Estimates of the sensor", caption=caption)
+
+
+def _or_dash(estimate: Interval | None) -> str:
+    if estimate is None:
+        return "–"
+    return interval(estimate, 2)
 
 
 # --- figures ----------------------------------------------------------------------------------------
@@ -64,8 +75,8 @@ def _over_disparity(of: Characterisation) -> Figure:
     def draw() -> Drawing:
         figure, (axes,) = canvas(2.2)
         if of.growth is not None:
-            sigma = np.array([(s.value, s.low, s.high) for s in of.growth.sigma])
-            nodes = np.asarray(of.growth.nodes)
+            sigma = np.array(of.growth.sigma)
+            nodes = of.growth.nodes
             band(axes, nodes, sigma[:, 1:], "interval")
             axes.plot(nodes, sigma[:, 0], label="sigma of d", marker="o", markersize=3.4, **stroke(MEASURED))
         axes.plot(*local_spread(of), label="all of a group", **dots(LOCAL))
@@ -84,16 +95,22 @@ def _over_disparity(of: Characterisation) -> Figure:
 
 def local_spread(of: Characterisation) -> tuple[Array, Array]:
     """Median disparity and standard deviation of r of disparity, px, in groups of about equal size."""
-    order = np.argsort(of.kept.ideal[:, 2])
-    groups = [g for g in np.array_split(order, min(LOCALLY, max(len(order) // 20, 1))) if len(g) > 1]
-    d = np.array([np.median(of.kept.ideal[g, 2]) for g in groups])
-    return d, np.array([of.kept.r[g, 2].std(ddof=1) for g in groups])
+    disparity = of.kept.ideal[:, 2]
+    groups = min(LOCALLY, max(len(disparity) // 20, 1))
+    middles = []
+    spreads = []
+    for group in np.array_split(np.argsort(disparity), groups):
+        if len(group) > 1:
+            middles.append(np.median(disparity[group]))
+            spreads.append(of.kept.r[group, 2].std(ddof=1))
+    return np.array(middles), np.array(spreads)
 
 
 def _bias_map(of: Characterisation) -> Figure:
     """Lines over u of the bias of u, v and d, one for each row of nodes."""
     assert of.bias is not None
-    bias, grid = of.bias, of.bias.grid
+    bias = of.bias
+    grid = of.bias.grid
     reach = 1.15 * max(float(np.nanmax(np.abs(bias.value) + bias.half)), 0.1)
 
     def draw() -> Drawing:

@@ -38,7 +38,7 @@ class Growth:
     @property
     def standard_error(self) -> Array:
         """Of ``sd``, (K,), px."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
     def table(self, sigma: float) -> DisparityGrowth:
         """The growth as a scenario has it, over a sensor's own ``sigma`` of disparity in px."""
@@ -105,7 +105,8 @@ def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
     nodes = _increasing(nodes)
     H = hats(means.truth[:, 2], nodes)
     _require_support(H, [f"disparity {node:g} px" for node in nodes])
-    s2, dof = means.variance[:, 2], means.count - 1.0
+    s2 = means.variance[:, 2]
+    dof = means.count - 1.0
     theta = np.full(len(nodes), np.sqrt(np.average(s2, weights=dof)))
     floor = 1e-3 * theta[0]
     for _ in range(ROUNDS):
@@ -132,7 +133,8 @@ def bias_map(means: TrackMeans, u: Array, v: Array) -> Biases:
     InputError
         A node has no track near it, or there are fewer tracks than nodes.
     """
-    u, v = _increasing(u), _increasing(v)
+    u = _increasing(u)
+    v = _increasing(v)
     H = bilinear(means.truth[:, 0], means.truth[:, 1], u, v)
     _require_support(H, [f"u = {x:g}, v = {y:g} px" for y in v for x in u])
     inverse = np.linalg.inv(H.T @ H)

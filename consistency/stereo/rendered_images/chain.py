@@ -149,7 +149,12 @@ class Chain:
         made = {role: stage(role, name, **given.get(role, {})) for role, name in stages.items()}
         return cls(**made, filters=tuple(stage("filter", name, **given.get(name, {})) for name in filters))
 
-    def run(self, frames: Iterable[StereoFrame], scene: Scene, camera: StereoCamera) -> Tracks:
+    def run(
+        self,
+        frames: Iterable[StereoFrame],
+        scene: Scene,
+        camera: StereoCamera,
+    ) -> Tracks:
         """Tracks of the features of the first frame through all frames.
 
         Raises
@@ -157,7 +162,8 @@ class Chain:
         InputError
             The search range misses every depth of the scene, or an image is smaller than a stage's window.
         """
-        state, parts = None, []
+        state = None
+        parts = []
         for number, frame in enumerate(frames):
             if state is None:
                 self._require_depths(scene, camera, frame.pose)
@@ -169,7 +175,12 @@ class Chain:
             raise InputError("frames: there is none; give at least one image pair")
         return Tracks(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Tracks)))
 
-    def _require_depths(self, scene: Scene, camera: StereoCamera, pose: Array) -> None:
+    def _require_depths(
+        self,
+        scene: Scene,
+        camera: StereoCamera,
+        pose: Array,
+    ) -> None:
         points, layer = scene.seen(pose, camera.left.field[::8, ::8].reshape(-1, 3))
         d = camera.ideal(to_camera(pose, points[layer >= 0]))[:, 2]
         low, high = self.correspondence.search
@@ -195,24 +206,42 @@ class _State:
             setattr(self, name, getattr(self, name)[chosen])
 
 
-def _begin(chain: Chain, frame: StereoFrame, scene: Scene, camera: StereoCamera) -> _State:
+def _begin(
+    chain: Chain,
+    frame: StereoFrame,
+    scene: Scene,
+    camera: StereoCamera,
+) -> _State:
     uv = chain.selection.choose(frame.left)
     anchors, layer = scene.seen(frame.pose, camera.left.rays(uv))
     d = _disparities(chain, frame, uv, camera.real(to_camera(frame.pose, anchors)))
     good = (layer >= 0) & (np.isfinite(d) if chain.stereo_first else True)
-    uv, anchors, d = uv[good], anchors[good], d[good]
+    uv = uv[good]
+    anchors = anchors[good]
+    d = d[good]
     patch = patches(frame.left, uv, np.ones(len(uv)))
     return _State(frame.left, uv, np.arange(len(uv)), anchors, at_junction(scene, camera, frame.pose, uv), patch, d)
 
 
-def _follow(chain: Chain, state: _State, frame: StereoFrame, camera: StereoCamera) -> None:
+def _follow(
+    chain: Chain,
+    state: _State,
+    frame: StereoFrame,
+    camera: StereoCamera,
+) -> None:
     true = camera.left.project(to_camera(frame.pose, state.anchors))
     state.uv, found = chain.tracking.follow(state.image, frame.left, state.uv, true)
     state.image = frame.left
     state.keep(found & camera.inside(state.uv, EDGE))
 
 
-def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, camera: StereoCamera) -> Tracks:
+def _observed(
+    chain: Chain,
+    state: _State,
+    number: int,
+    frame: StereoFrame,
+    camera: StereoCamera,
+) -> Tracks:
     real = camera.real(to_camera(frame.pose, state.anchors))
     d = _disparities(chain, frame, state.uv, real)
     now = patches(frame.left, state.uv, np.where(np.isfinite(d * state.d), d / state.d, 1.0))
@@ -231,13 +260,23 @@ def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, came
     return Tracks(same, same + number, state.track, z, truth, real, unlike, label, flag)
 
 
-def _disparities(chain: Chain, frame: StereoFrame, uv: Array, real: Array) -> Array:
+def _disparities(
+    chain: Chain,
+    frame: StereoFrame,
+    uv: Array,
+    real: Array,
+) -> Array:
     if isinstance(chain.correspondence, KnownDisparity):
-        return np.asarray(real[:, 2])
+        return real[:, 2]
     return chain.correspondence.measure(frame.left, frame.right, uv)
 
 
-def at_junction(scene: Scene, camera: StereoCamera, pose: Array, uv: Array) -> Array:
+def at_junction(
+    scene: Scene,
+    camera: StereoCamera,
+    pose: Array,
+    uv: Array,
+) -> Array:
     """Whether the window of a feature (N, 2) px shows two depths, so that it is on the edge of a layer, (N,) bool."""
     reach = np.linspace(-WINDOW / 2.0, WINDOW / 2.0, 7)
     grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
@@ -246,4 +285,4 @@ def at_junction(scene: Scene, camera: StereoCamera, pose: Array, uv: Array) -> A
     d = np.where(layer >= 0, camera.f * camera.B / to_camera(pose, points)[:, 0], 0.0).reshape(len(uv), -1)
     d.sort(axis=1)
     few = int(np.ceil(SHARE * d.shape[1]))
-    return np.asarray(d[:, -few] - d[:, few - 1] > STEP)
+    return d[:, -few] - d[:, few - 1] > STEP

@@ -32,7 +32,12 @@ class StereoFrame:
     nominal: Array  # (6,), where it is said to have been
 
 
-def render(scene: Scene, camera: Camera, pose: Array, offset: Array | None = None) -> Array:
+def render(
+    scene: Scene,
+    camera: Camera,
+    pose: Array,
+    offset: Array | None = None,
+) -> Array:
     """Image (h, w) of a scene without noise, grey values as float.
 
     Parameters
@@ -52,14 +57,25 @@ def render(scene: Scene, camera: Camera, pose: Array, offset: Array | None = Non
     return image
 
 
-def _near(layer: Layer, reach: Array, a: Array, b: Array, margin: Array) -> Array:
+def _near(
+    layer: Layer,
+    reach: Array,
+    a: Array,
+    b: Array,
+    margin: Array,
+) -> Array:
     """Which of the places on a plane are on the layer or within ``margin`` m of it, and before the camera."""
     with np.errstate(invalid="ignore"):
         inside = (np.abs(a) < layer.half[0] + margin) & (np.abs(b) < layer.half[1] + margin)
-        return np.asarray(inside & (reach > 0.0) & np.isfinite(reach))
+        return inside & (reach > 0.0) & np.isfinite(reach)
 
 
-def _box(layer: Layer, origin: Array, rays: Array, f: float) -> tuple[slice, slice] | None:
+def _box(
+    layer: Layer,
+    origin: Array,
+    rays: Array,
+    f: float,
+) -> tuple[slice, slice] | None:
     """Rows and columns of an image whose rays (h, w, 3) may meet the layer, from every COARSE-th of them."""
     coarse = rays[::COARSE, ::COARSE]
     reach, a, b = layer.meet(origin, coarse.reshape(-1, 3))
@@ -71,7 +87,13 @@ def _box(layer: Layer, origin: Array, rays: Array, f: float) -> tuple[slice, sli
     return rows, columns
 
 
-def _painted(image: Array, layer: Layer, origin: Array, rays: Array, f: float) -> Array:
+def _painted(
+    image: Array,
+    layer: Layer,
+    origin: Array,
+    rays: Array,
+    f: float,
+) -> Array:
     """A layer before what ``image`` (N,) shows along ``rays`` (N, 3)."""
     reach, a, b = layer.meet(origin, rays)
     blur = BLUR / f * reach  # rays have length 1 along the axis: their reach is the depth
@@ -79,7 +101,9 @@ def _painted(image: Array, layer: Layer, origin: Array, rays: Array, f: float) -
     if not hit.any():
         return image
     if not hit.all():
-        a, b, blur = a[hit], b[hit], blur[hit]
+        a = a[hit]
+        b = b[hit]
+        blur = blur[hit]
     own = layer.texture.grey(a, b, blur[0] if np.ptp(blur) < 1e-9 * blur[0] else blur)
     if np.isfinite(layer.half).any():
         cover = _covered(a, layer.half[0], blur) * _covered(b, layer.half[1], blur)
@@ -91,7 +115,7 @@ def _painted(image: Array, layer: Layer, origin: Array, rays: Array, f: float) -
 
 def _covered(place: Array, half: float, blur: Array) -> Array:
     """Share of the point spread that is within ``half`` of the middle, along one axis."""
-    return np.asarray(ndtr((half - place) / blur) - ndtr((-half - place) / blur))
+    return ndtr((half - place) / blur) - ndtr((-half - place) / blur)
 
 
 def render_pair(scene: Scene, camera: StereoCamera, pose: Array) -> tuple[Array, Array]:
@@ -121,9 +145,11 @@ def film(
     noise : sd of the grey noise of a pixel
     nominal : (F, 6), where it is said to be; None for ``poses``
     """
-    last, pair = np.empty(0), (np.empty(0), np.empty(0))
+    last = np.empty(0)
+    pair = (np.empty(0), np.empty(0))
     for pose, said in zip(poses, poses if nominal is None else nominal, strict=True):
         if not np.array_equal(pose, last):
-            last, pair = pose, render_pair(scene, camera, pose)
+            last = pose
+            pair = render_pair(scene, camera, pose)
         left, right = (digitised(image, noise, rng) for image in pair)
         yield StereoFrame(left, right, np.asarray(pose), np.asarray(said))

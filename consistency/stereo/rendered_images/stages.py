@@ -70,12 +70,12 @@ class Spread:
 
 def to_columns(image: Array, uv: Array) -> Array:
     """Places (N, 2) px from the middle of an image, from the centre of its first pixel."""
-    return np.asarray(uv + (np.array(image.shape[::-1]) - 1.0) / 2.0)
+    return uv + (np.array(image.shape[::-1]) - 1.0) / 2.0
 
 
 def from_columns(image: Array, places: Array) -> Array:
     """The inverse of :func:`to_columns`."""
-    return np.asarray(places - (np.array(image.shape[::-1]) - 1.0) / 2.0)
+    return places - (np.array(image.shape[::-1]) - 1.0) / 2.0
 
 
 def require_size(image: Array, least: int, what: str) -> None:
@@ -91,7 +91,13 @@ def require_size(image: Array, least: int, what: str) -> None:
 class Tracking(Protocol):
     """Follows features from one left image to the next."""
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         """Where features are in ``after``.
 
         Parameters
@@ -111,7 +117,13 @@ class Tracking(Protocol):
 class KnownProjection:
     """No tracker: each feature is where its point is projected."""
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         return true, np.ones(len(uv), bool)
 
 
@@ -123,7 +135,13 @@ class Klt:
     levels: int = 3
     agreement: float | None = None
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         require_size(before, self.window + 2, f"the tracker's window of {self.window} px")
         there, found = self.flow(before, after, uv)
         if self.agreement is not None:
@@ -131,7 +149,12 @@ class Klt:
             found &= again & (np.hypot(*(back - uv).T) <= self.agreement)
         return there, found
 
-    def flow(self, before: Array, after: Array, uv: Array) -> tuple[Array, Array]:
+    def flow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+    ) -> tuple[Array, Array]:
         if not len(uv):
             return uv, np.zeros(0, bool)
         cv2 = opencv()
@@ -150,7 +173,12 @@ class Correspondence(Protocol):
     def search(self) -> tuple[int, int]:
         """Least and greatest disparity, px."""
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         """Disparities (N,) of places ``uv`` (N, 2), px from the middle of the left image; NaN where there is none."""
 
 
@@ -190,7 +218,12 @@ class BlockMatching:
     uniqueness: int = 10  # % by which the best match must be better than others
     texture: int = 10  # least texture of a block
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         count = _searched(left, self.search, self.block)
         matcher: Any = opencv().StereoBM_create(count, self.block)
         matcher.setMinDisparity(self.search[0])
@@ -207,7 +240,12 @@ class SemiGlobal:
     block: int = 5  # px, odd
     uniqueness: int = 10  # %
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         count = _searched(left, self.search, self.block)
         area = self.block**2
         matcher: Any = opencv().StereoSGBM_create(
@@ -225,7 +263,12 @@ class KltAcross:
     levels: int = 3
     rows: float = 1.5
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         _require_range(self.search)
         tracker = Klt(self.window, self.levels)
         there, found = tracker.follow(left, right, uv, uv)
@@ -240,7 +283,12 @@ class KnownDisparity:
 
     search: tuple[int, int] = SEARCH
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         return np.full(len(uv), np.nan)
 
 
@@ -275,7 +323,7 @@ class LeftRightCheck:
         own = np.where(np.isfinite(evidence.d), evidence.d, 0.0)
         there = np.stack([own - evidence.uv[:, 0], evidence.uv[:, 1]], axis=-1)
         back = evidence.correspondence.measure(left, right, there)
-        return np.asarray(np.abs(back - evidence.d) <= self.tolerance)
+        return np.abs(back - evidence.d) <= self.tolerance
 
 
 @dataclass(frozen=True)
@@ -285,7 +333,7 @@ class TrackResidual:
     limit: float = 0.6
 
     def keep(self, evidence: PairObservations) -> Array:
-        return np.asarray(evidence.dissimilarity <= self.limit)
+        return evidence.dissimilarity <= self.limit
 
 
 def patches(image: Array, uv: Array, zoom: Array) -> Array:
@@ -298,7 +346,7 @@ def patches(image: Array, uv: Array, zoom: Array) -> Array:
     places = to_columns(image, uv)[:, None] + zoom[:, None, None] * grid
     values = map_coordinates(image.astype(np.float32), places[..., ::-1].transpose(2, 0, 1), order=1, mode="nearest")
     values = values - values.mean(axis=1, keepdims=True)
-    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9))
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
 
 
 def dissimilarity(first: Array, now: Array) -> Array:
@@ -307,4 +355,4 @@ def dissimilarity(first: Array, now: Array) -> Array:
     Shi & Tomasi (1994) sec. 4, of patches whose mean and contrast are taken out; in place of their affine motion a
     patch is zoomed by the measured disparity.
     """
-    return np.asarray(np.linalg.norm(first - now, axis=1))
+    return np.linalg.norm(first - now, axis=1)

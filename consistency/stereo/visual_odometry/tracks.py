@@ -93,14 +93,20 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
     return table[["step", "landmark", *PIXELS]].reset_index(drop=True)
 
 
-def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: TrackSelection) -> list[tuple[int, int]]:
+def _next_landmarks(
+    candidates: pd.DataFrame,
+    crowd: Indices,
+    free: int,
+    rule: TrackSelection,
+) -> list[tuple[int, int]]:
     """(piece, life) of the next landmarks, one column of the image after the other."""
     order = candidates.assign(life=candidates["left"].clip(upper=rule.max_age)).sort_values(
         ["life", "z2", "piece"], ascending=[False, False, True]
     )
     parts = [order[order["band"] == b] for b in range(rule.bands)]
     queues = [list(zip(q["piece"], q["left"], strict=True)) for q in parts]
-    crowd, result = crowd.copy(), list[tuple[int, int]]()
+    crowd = crowd.copy()
+    result = list[tuple[int, int]]()
     while len(result) < free and any(queues):
         band = min((b for b in range(rule.bands) if queues[b]), key=lambda b: crowd[b])
         result.append(queues[band].pop(0))

@@ -56,7 +56,12 @@ class Derivatives:
     qz2: Array  # (N, 3, k)
 
 
-def cost_derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
+def cost_derivatives(
+    frames: TwoFrames,
+    pose: RelativePose,
+    q: Array,
+    exact: bool,
+) -> Derivatives:
     """First and second derivatives of f in closed form at ``q`` (N, 3), the points in frame 2.
 
     Without ``exact`` they are Gauss-Newton's, which leave out second derivatives of the measurement. With a = R q + t
@@ -69,19 +74,32 @@ def cost_derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: boo
     At[:, :3] = np.eye(3)
     At[:, 3:] = np.swapaxes(R_k @ q.T, 0, 2).swapaxes(1, 2)
     AtH = At @ f_aa
-    dd, dq = AtH @ np.swapaxes(At, 1, 2), AtH @ R
+    dd = AtH @ np.swapaxes(At, 1, 2)
+    dq = AtH @ R
     if exact:
         outer = (f_a[:, :, None] * q[:, None]).reshape(-1, 9)
         dd[:, 3:, 3:] += (outer @ R_kl.reshape(9, 9).T).reshape(-1, 3, 3)
         dq[:, 3:] += np.swapaxes(np.swapaxes(R_k, 1, 2) @ f_a.T, 0, 2).swapaxes(1, 2)
     return Derivatives(
-        d=(At @ f_a[:, :, None])[:, :, 0], q=f_a @ R + f_b, z1=f_z1, z2=f_z2,
-        dd=dd, dq=dq, qq=R.T @ f_aa @ R + f_bb, dz1=At @ f_az, qz1=R.T @ f_az, qz2=f_bz,
-    )  # fmt: skip
+        d=(At @ f_a[:, :, None])[:, :, 0],
+        q=f_a @ R + f_b,
+        z1=f_z1,
+        z2=f_z2,
+        dd=dd,
+        dq=dq,
+        qq=R.T @ f_aa @ R + f_bb,
+        dz1=At @ f_az,
+        qz1=R.T @ f_az,
+        qz2=f_bz,
+    )
 
 
 def _frame(
-    measure: PointMatches | PixelMatches, z: Array, W: Array, p: Array, exact: bool
+    measure: PointMatches | PixelMatches,
+    z: Array,
+    W: Array,
+    p: Array,
+    exact: bool,
 ) -> tuple[Array, Array, Array, Array]:
     """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
     J = measure.jacobian(p)
@@ -104,7 +122,12 @@ class PointMatches:
         """Identity, (N, 3, 3)."""
         return np.broadcast_to(np.eye(3), (len(p), 3, 3))
 
-    def second(self, p: Array, J: Array, w: Array) -> Array:
+    def second(
+        self,
+        p: Array,
+        J: Array,
+        w: Array,
+    ) -> Array:
         """Zero, (N, 3, 3)."""
         return np.zeros((len(p), 3, 3))
 
@@ -117,18 +140,24 @@ class PixelMatches:
 
     def __init__(self, rig: StereoRig) -> None:
         P = rig.cameras
-        self.top, self.last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
+        self.top = P[:, :2].reshape(4, 4)
+        self.last = P[:, 2].repeat(2, axis=0)
 
     def value(self, p: Array) -> Array:
         """u, v, u', v' of points (N, 3), (N, 4), px."""
-        return np.asarray((p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p))
+        return (p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p)
 
     def jacobian(self, p: Array) -> Array:
         """Derivative of :meth:`value` by the point, (N, 4, 3), px/m."""
         w_p = self.last[:, :3]
-        return np.asarray((self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None])
+        return (self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None]
 
-    def second(self, p: Array, J: Array, w: Array) -> Array:
+    def second(
+        self,
+        p: Array,
+        J: Array,
+        w: Array,
+    ) -> Array:
         """Second derivatives of the four pixels, weighted with w (N, 4) and summed, (N, 3, 3); J is (N, 4, 3)."""
         half = np.swapaxes(J * (w / self._depth(p))[:, :, None], 1, 2) @ self.last[:, :3]
         return -(half + np.swapaxes(half, 1, 2))

@@ -54,7 +54,12 @@ def same_length(names: str, *arrays: Array) -> None:
         raise InputError(f"{names}: {counts} rows, they must be matched row by row")
 
 
-def covariances(name: str, value: Any, count: int, size: int) -> Array:
+def covariances(
+    name: str,
+    value: Any,
+    count: int,
+    size: int,
+) -> Array:
     """``value`` of shape (size, size), for all rows, or (count, size, size), as the latter.
 
     Raises
@@ -83,9 +88,12 @@ def floats(name: str, value: Any) -> Array:
         array: Array = np.asarray(value, float)
     except (TypeError, ValueError):
         raise InputError(f"{name}: not an array of numbers") from None
-    if (bad := ~(np.abs(array) <= LARGEST)).any():
-        index = tuple(int(i) for i in np.argwhere(bad)[0])
-        why = "too large" if np.isfinite(array[index]) else "not finite"
+    bad = np.argwhere(~(np.abs(array) <= LARGEST))
+    if len(bad):
+        index = tuple(bad[0].tolist())
+        why = "not finite"
+        if np.isfinite(array[index]):
+            why = "too large"
         raise InputError(f"{name}: {why} at index {index}; leave such rows out")
     return array
 
@@ -98,17 +106,23 @@ def symmetric_inverses(C: Array) -> tuple[Array, Array]:
     """
     if C.shape[-1] != 3:
         one = np.eye(C.shape[-1])
-        finite = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
+        finite = np.isfinite(C).all(axis=(-2, -1))
         definite = finite & (np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0] > 0.0)
         return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
-    a, b, c, d, e, f = (C[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    a, b, c = np.moveaxis(C[..., 0, :], -1, 0)
+    d, e = C[..., 1, 1], C[..., 1, 2]
+    f = C[..., 2, 2]
+    minor = a * d - b * b
     out = np.empty_like(C)
     out[..., 0, 0] = d * f - e * e
-    out[..., 0, 1] = out[..., 1, 0] = c * e - b * f
-    out[..., 0, 2] = out[..., 2, 0] = b * e - c * d
+    out[..., 0, 1] = c * e - b * f
+    out[..., 0, 2] = b * e - c * d
+    out[..., 1, 0] = out[..., 0, 1]
     out[..., 1, 1] = a * f - c * c
-    out[..., 1, 2] = out[..., 2, 1] = b * c - a * e
-    out[..., 2, 2] = minor = a * d - b * b
+    out[..., 1, 2] = b * c - a * e
+    out[..., 2, 0] = out[..., 0, 2]
+    out[..., 2, 1] = out[..., 1, 2]
+    out[..., 2, 2] = minor
     det = a * out[..., 0, 0] + b * out[..., 0, 1] + c * out[..., 0, 2]
     definite = (a > 0.0) & (minor > 0.0) & (det > 0.0)
     out /= np.where(definite, det, 1.0)[..., None, None]

@@ -42,7 +42,9 @@ def grid_of(data: Residuals, u: Array, v: Array) -> Grid:
     """Nodes at ``u`` (K,) and ``v`` (L,), and what the data have around each."""
     weights = bilinear(data.ideal[:, 0], data.ideal[:, 1], u, v)
     rows = weights.sum(axis=0)
-    tracks = (np.add.reduceat(weights, data.first, axis=0) > 1.0).sum(axis=0) if len(data) else np.zeros(len(rows))
+    if not len(data):
+        return Grid(u, v, rows, np.zeros(len(rows), bool))
+    tracks = (np.add.reduceat(weights, data.first, axis=0) > 1.0).sum(axis=0)
     return Grid(u, v, rows, (rows >= FEW) & (tracks >= TRACKS))
 
 
@@ -76,7 +78,9 @@ def estimate_bias(
     rate : probability of finding a bias in a coordinate that has none
     """
     known = grid.known
-    value, half, believed = (np.full((3, len(known)), fill) for fill in (np.nan, np.nan, 0.0))
+    value = np.full((3, len(known)), np.nan)
+    half = np.full((3, len(known)), np.nan)
+    believed = np.zeros((3, len(known)))
     p_value = np.ones(3)
     for k, fit in enumerate(fits):
         beta, width, C = coordinate_fit.bias_coefficients(fit, level)

@@ -140,23 +140,22 @@ def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
     rows that is about 1 / n, and is given back.
     """
     rows = fit.rows
-    beta = fit.regression.beta
-    e = (rows.r - rows.X @ beta) / (rows.G @ fit.parameters.a)
-    n = np.diff(np.append(rows.first, len(e)))
-    e = e - (np.add.reduceat(e, rows.first) / n)[rows.track]
-    place = np.cumsum(np.where(rows.gap > 0, rows.gap, 0.0))
     track = rows.track
-    variance = float((e**2).sum() / max(len(e) - len(n), 1))
+    e = (rows.r - rows.X @ fit.regression.beta) / (rows.G @ fit.parameters.a)
+    n = np.bincount(track)
+    e -= (np.add.reduceat(e, rows.first) / n)[track]
+    variance = (e**2).sum() / max(len(e) - len(n), 1)
+    place = np.cumsum(rows.gap)
     values = np.full(LAGS, np.nan)
     bounds = np.full(LAGS, np.nan)
     for lag in range(1, LAGS + 1):
-        later = np.arange(lag, len(e))
-        pair = later[(track[lag:] == track[:-lag]) & (place[lag:] - place[:-lag] == lag)]
-        if len(pair) < FEWEST_PAIRS:
+        together = (track[lag:] == track[:-lag]) & (place[lag:] - place[:-lag] == lag)
+        before = np.flatnonzero(together)
+        if len(before) < FEWEST_PAIRS:
             break
-        given_back = float((1.0 / n[track[pair]]).mean())
-        values[lag - 1] = float((e[pair] * e[pair - lag]).mean()) / variance + given_back
-        bounds[lag - 1] = 1.96 / np.sqrt(len(pair))
+        given_back = (1.0 / n[track[before]]).mean()
+        values[lag - 1] = (e[before + lag] * e[before]).mean() / variance + given_back
+        bounds[lag - 1] = 1.96 / np.sqrt(len(before))
     return values, bounds
 
 

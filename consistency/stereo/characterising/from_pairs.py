@@ -16,10 +16,11 @@ from consistency.stereo.characterising.log_residuals import robust_sd
 from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
 from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.stereo.visual_odometry.tracks import PIXELS
 
 CHOSEN = (
     "Tracks are matches on which a motion could be agreed: RANSAC's gate cuts off the largest errors before they are "
@@ -36,17 +37,22 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
         As :func:`consistency.vision.read_sequence`; too few pairs; neither at rest nor with true poses.
     """
     sequence = read_sequence(folder, options.calibration, options.format, options.left, options.right)
-    rig = sequence.rectification.rig
-    if not is_rectified(rig):
-        raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    rig = sequence.uvd_rig
     if len(sequence) < SHORTEST:
         raise InputError(f"{folder}: holds {len(sequence)} stereo pairs; a noise takes at least {SHORTEST}")
     R, t = _poses(sequence, options)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed or 0))
     seen = _seen(rig, motions, R, t)
+    notes = []
+    if options.at_rest:
+        notes.append(REST)
     free = options.free_poses or options.at_rest
-    notes = (*((REST,) if options.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
-    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), notes, free)
+    if free:
+        notes.append(FREE)
+    else:
+        notes.append(EXACT)
+    notes += [CHOSEN, rows_note(rig, motions)]
+    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), tuple(notes), free)
 
 
 def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
@@ -80,13 +86,12 @@ def _seen(
     R: Array,
     t: Array,
 ) -> Seen:
-    rows = observations(rig, motions).sort_values(["piece", "step"])
+    rows = observations(rig, motions)
+    rows = rows[rows["z2"] > 0]
     step = rows["step"].to_numpy(np.int64)
-    z = rows[["z0", "z1", "z2"]].to_numpy(float)
-    near = z[:, 2] > 0
-    moving = np.full(len(step), bool(np.ptp(t, axis=0).any()))
-    seen = Seen(z, (R @ CAMERA)[step], t[step], rows["piece"].to_numpy(np.int64), step, moving)
-    return seen.keep(near)
+    track = rows["piece"].to_numpy(np.int64)
+    moving = np.full(len(step), np.ptp(t, axis=0).any())
+    return Seen(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
 
 
 def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:

@@ -56,24 +56,22 @@ def characterise_posed(
     InputError
         Too few observations or tracks are left.
     """
-    assert sensor.f is not None
-    assert sensor.B is not None
     total = len(seen.z)
     seen = seen.long_enough()
     _require_enough(seen, total, source)
-    first = fit_points(seen, sensor.f, sensor.B, coordinates_as_parts(seen), np.ones(3), free_poses)
+    first = fit_points(seen, *sensor.rig, coordinates_as_parts(seen), np.ones(3), free_poses)
     good = without_gross(first)
     inside = within_limits(first.ideal, MARGIN * first.sigma, sensor)
     kept = seen.keep(good & inside).long_enough()
     _require_enough(kept, total, source)
-    plain = fit_points(kept, sensor.f, sensor.B, coordinates_as_parts(kept), first.sigma, free_poses)
+    plain = fit_points(kept, *sensor.rig, coordinates_as_parts(kept), first.sigma, free_poses)
     levels = Levels(RATE)
     chosen = plain
     growth = None
     nodes, nearest = _disparity_nodes(plain)
     if nearest is not None:
         levels = Levels(RATE, growth=len(nodes))
-        by_disparity = _fit_by_disparity(plain, nearest, len(nodes), sensor.f, sensor.B, free_poses)
+        by_disparity = _fit_by_disparity(plain, nearest, len(nodes), sensor, free_poses)
         growth = _growth(nodes, by_disparity, levels)
         if growth.shown:
             chosen = by_disparity
@@ -127,12 +125,12 @@ def _disparity_nodes(plain: Fitted) -> tuple[Array, Indices | None]:
     return nodes, nearest
 
 
-def _fit_by_disparity(plain: Fitted, nearest: Indices, nodes: int, f: float, B: float, free_poses: bool) -> Fitted:
+def _fit_by_disparity(plain: Fitted, nearest: Indices, nodes: int, sensor: PicturedSensor, free_poses: bool) -> Fitted:
     """The fit in which the disparity has a noise of its own around each node."""
     parts = coordinates_as_parts(plain.seen)
     parts[:, 2] += nearest
     start = np.append(plain.sigma[:2], np.full(nodes, plain.sigma[2]))
-    return fit_points(plain.seen, f, B, parts, start, free_poses)
+    return fit_points(plain.seen, *sensor.rig, parts, start, free_poses)
 
 
 def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[Interval, float]:

@@ -128,6 +128,7 @@ class LikelihoodFit:
     robust: Array  # (m + 2, m + 2), of theta by the scatter of the tracks' scores: right for any noise
     regression: Regression
     parameters: Parameters
+    memory: bool  # whether offset and correlation were estimated
 
     @property
     def tracks(self) -> int:
@@ -208,6 +209,7 @@ def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
         robust=np.pad(robust, (0, missing)),
         regression=regression,
         parameters=likelihood.parameters(x),
+        memory=memory,
     )
 
 

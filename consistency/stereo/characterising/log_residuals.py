@@ -77,8 +77,6 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
 
     What is ideal is Herath et al. (2007) eq. 22 at the true poses.
     """
-    assert sensor.f is not None
-    assert sensor.B is not None
     parts = []
     strange = 0
     for number, trial in enumerate(trials):
@@ -91,7 +89,7 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
         landmark = trial.landmark[rows]
         body = point.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
         in_sensor = point.to_sensor(*body, sensor.mount.packed())
-        ideal = np.stack(stereo.project(*in_sensor, sensor.f, sensor.B), axis=-1)
+        ideal = np.stack(stereo.project(*in_sensor, *sensor.rig), axis=-1)
         track = landmark + number * trial.n_landmarks
         parts.append((trial.z[rows] - ideal, ideal, track, step, moved_before(trial.truth)[step]))
     return Residuals(*map(np.concatenate, zip(*parts, strict=True))), strange

@@ -183,7 +183,8 @@ def slopes_of(
     sigma: Array,
 ) -> Slopes:
     """Slopes at points (T, 3) seen as ``z`` (T, n, 3) from poses (T, n, 3, 3), (T, n, 3), with noise (T, n, 3)."""
-    x, y, w = np.moveaxis(np.einsum("tnji,tnj->tni", R, points[:, None] - t), -1, 0)
+    in_sensor = np.einsum("tnji,tnj->tni", R, points[:, None] - t)
+    x, y, w = np.moveaxis(in_sensor, -1, 0)
     x = np.maximum(x, NEAREST)
     predicted = np.stack(stereo.project(x, y, w, f, B), axis=-1)
     zero = np.zeros_like(x)
@@ -233,10 +234,13 @@ def steps_of_both(slopes: list[Slopes], at: list[Indices], steps: int) -> tuple[
     for s, own in zip(slopes, at, strict=True):
         W = s.pose_by_point
         pull = np.einsum("tij,tncj,tnc->ti", s.cov, s.by_point, s.r)
-        np.add.at(g, own, np.einsum("tnci,tnc->tni", s.by_pose, s.r) - np.einsum("tnij,tj->tni", W, pull))
+        with_points_held = np.einsum("tnci,tnc->tni", s.by_pose, s.r)
+        np.add.at(g, own, with_points_held - np.einsum("tnij,tj->tni", W, pull))
         np.add.at(N, (own, own), np.einsum("tnci,tncj->tnij", s.by_pose, s.by_pose))
-        np.add.at(N, (own[:, :, None], own[:, None, :]), -np.einsum("tnij,tjk,tmlk->tnmil", W, s.cov, W))
-    Q = _inverse(N.swapaxes(1, 2).reshape(steps * POSE, -1)).reshape(steps, POSE, steps, POSE)
+        by_points = np.einsum("tnij,tjk,tmlk->tnmil", W, s.cov, W)
+        np.subtract.at(N, (own[:, :, None], own[:, None, :]), by_points)
+    flat = N.swapaxes(1, 2).reshape(steps * POSE, -1)
+    Q = _inverse(flat).reshape(steps, POSE, steps, POSE)
     moves = np.einsum("siuj,uj->si", Q, g)
     return [_step(s, own, Q, moves) for s, own in zip(slopes, at, strict=True)], moves
 
@@ -255,15 +259,18 @@ def _step(
 ) -> Step:
     held = step_of_points(s)
     W = s.pose_by_point
-    mine = moves[at]  # (T, n, 6)
-    points = held.points - np.einsum("tij,tnkj,tnk->ti", s.cov, W, mine)
-    r = s.r - np.einsum("tnci,ti->tnc", s.by_point, points) - np.einsum("tnci,tni->tnc", s.by_pose, mine)
+    own_moves = moves[at]  # (T, n, 6)
+    points = held.points - np.einsum("tij,tnkj,tnk->ti", s.cov, W, own_moves)
+    r = s.r - np.einsum("tnci,ti->tnc", s.by_point, points)
+    r -= np.einsum("tnci,tni->tnc", s.by_pose, own_moves)
     # a prediction by the poses of all steps of its track, the point following them
     n = at.shape[1]
+    each = np.arange(n)
     slope = -np.einsum("tnci,tij,tmkj->tncmk", s.by_point, s.cov, W)
-    slope[:, np.arange(n), :, np.arange(n)] += np.moveaxis(s.by_pose, 1, 0)
+    slope[:, each, :, each] += np.moveaxis(s.by_pose, 1, 0)
     flat = slope.reshape(*slope.shape[:3], -1)  # (T, n, 3, 6 n)
-    own = Q[at[:, :, None], :, at[:, None, :], :].swapaxes(2, 3).reshape(len(at), POSE * n, -1)
+    own = Q[at[:, :, None], :, at[:, None, :], :]
+    own = own.swapaxes(2, 3).reshape(len(at), POSE * n, -1)
     along = flat @ own[:, None]
     free = held.free - np.einsum("tnck,tnck->tnc", along, flat)
     neighbours = held.neighbours.copy()

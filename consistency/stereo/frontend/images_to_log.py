@@ -23,7 +23,6 @@ from consistency.referee.types import Array
 from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of, stacked
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
-from consistency.stereo.visual_odometry.cameras.rig import is_rectified
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
@@ -161,9 +160,7 @@ def write_frontend_log(
     if len(sequence) >= FEWEST:
         kind = "log"
     require_free(out, overwrite, kind)
-    rig = sequence.rectification.rig
-    if not is_rectified(rig):
-        raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    rig = sequence.uvd_rig
     path = options.truth or find_truth(sequence)
     truth = None
     if path is not None:

@@ -88,9 +88,8 @@ def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Pla
     turn, _ = in_robot_axes(R, t, robot_axes(t), 0.0)
     tilts = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()[:, :2], axis=1)
     sensor = belief.sensor
-    assert sensor.f is not None
     u, v, d = sensor.sigma
-    wide = sensor.f / NEAR
+    wide = sensor.rig[0] / NEAR
     return Plane((u, v, d), (wide, wide, float(np.median(trial.z[:, 2])) / NEAR), tilts)
 
 

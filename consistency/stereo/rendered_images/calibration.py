@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, bilinear, hats
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 from consistency.stereo.rendered_images.chain import Tracks
 
 ROUNDS = 30  # of the fit of the growth, which settles in a few
@@ -77,13 +77,18 @@ def track_means(tracks: Tracks, fewest: int = FEWEST) -> TrackMeans:
     if not long.any():
         raise InputError(f"tracks: none has {fewest} observations; track through more images")
 
-    def mean(values: Array) -> Array:
-        sums = [np.bincount(number, weights=column) for column in values.T]
-        return np.stack(sums, axis=-1) / count[:, None]
+    errors = _means(tracks.errors, number, count)
+    scatter = _means((tracks.errors - errors[number]) ** 2, number, count)
+    scatter *= (count / np.maximum(count - 1, 1))[:, None]
+    truth = _means(tracks.truth, number, count)
+    return TrackMeans(truth[long], errors[long], scatter[long], count[long])
 
-    errors = mean(tracks.errors)
-    scatter = mean((tracks.errors - errors[number]) ** 2) * (count / np.maximum(count - 1, 1))[:, None]
-    return TrackMeans(mean(tracks.truth)[long], errors[long], scatter[long], count[long])
+
+def _means(values: Array, number: Indices, count: Indices) -> Array:
+    """Means (n, 3) over tracks of values (M, 3) of the tracks ``number`` (M,)."""
+    sums = np.zeros((len(count), values.shape[1]))
+    np.add.at(sums, number, values)
+    return sums / count[:, None]
 
 
 def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
@@ -113,7 +118,8 @@ def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
         sd = H @ theta
         weight = 2.0 * dof / sd**2  # information of s^2 on sd
         step = (s2 - sd**2) / (2.0 * sd)
-        theta = np.maximum(theta + np.linalg.solve(H.T @ (weight[:, None] * H), H.T @ (weight * step)), floor)
+        information = H.T @ (weight[:, None] * H)
+        theta = np.maximum(theta + np.linalg.solve(information, H.T @ (weight * step)), floor)
     sd = H @ theta
     information = H.T @ ((2.0 * dof / sd**2)[:, None] * H)
     excess = 0.5 * dof * (s2 / sd**2 - 1.0) ** 2

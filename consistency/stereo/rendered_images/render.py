@@ -46,7 +46,9 @@ def render(
     offset : (3,), of the camera in the robot frame, m; None for none
     """
     R = rotation(*pose[3:])
-    origin = pose[:3] if offset is None else pose[:3] + R @ offset
+    origin = pose[:3]
+    if offset is not None:
+        origin = origin + R @ offset
     rays = camera.field @ R.T
     image = np.full(rays.shape[:2], MIDDLE, np.float32)
     for layer in scene.layers:
@@ -82,9 +84,13 @@ def _box(
     near = _near(layer, reach, a, b, (2.0 * COARSE + REACH * BLUR) / f * reach).reshape(coarse.shape[:2])
     if not near.any():
         return None
-    ends = (np.flatnonzero(near.any(axis=axis))[[0, -1]] * COARSE for axis in (1, 0))
-    rows, columns = (slice(max(low - COARSE, 0), high + 2 * COARSE) for low, high in ends)
-    return rows, columns
+    return _extent(near.any(axis=1)), _extent(near.any(axis=0))
+
+
+def _extent(near: Array) -> slice:
+    """The part of an image, along one axis, around every ``COARSE``-th place that is near."""
+    places = np.flatnonzero(near) * COARSE
+    return slice(max(places[0] - COARSE, 0), places[-1] + 2 * COARSE)
 
 
 def _painted(
@@ -104,7 +110,10 @@ def _painted(
         a = a[hit]
         b = b[hit]
         blur = blur[hit]
-    own = layer.texture.grey(a, b, blur[0] if np.ptp(blur) < 1e-9 * blur[0] else blur)
+    one_blur = blur
+    if np.ptp(blur) < 1e-9 * blur[0]:
+        one_blur = blur[0]
+    own = layer.texture.grey(a, b, one_blur)
     if np.isfinite(layer.half).any():
         cover = _covered(a, layer.half[0], blur) * _covered(b, layer.half[1], blur)
         own = cover * own + (1.0 - cover) * image[hit]
@@ -145,11 +154,13 @@ def film(
     noise : sd of the grey noise of a pixel
     nominal : (F, 6), where it is said to be; None for ``poses``
     """
+    if nominal is None:
+        nominal = poses
     last = np.empty(0)
-    pair = (np.empty(0), np.empty(0))
-    for pose, said in zip(poses, poses if nominal is None else nominal, strict=True):
+    for pose, stated in zip(poses, nominal, strict=True):
         if not np.array_equal(pose, last):
             last = pose
-            pair = render_pair(scene, camera, pose)
-        left, right = (digitised(image, noise, rng) for image in pair)
-        yield StereoFrame(left, right, np.asarray(pose), np.asarray(said))
+            left, right = render_pair(scene, camera, pose)
+        seen_left = digitised(left, noise, rng)
+        seen_right = digitised(right, noise, rng)
+        yield StereoFrame(seen_left, seen_right, np.asarray(pose), np.asarray(stated))

@@ -18,7 +18,8 @@ from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 BLOCK = 7  # px, window of the structure tensor
 MARGIN = 12.0  # px from the border, so that the windows of later stages are whole
-STEPS, SMALL = 40, 0.003  # iterations of Lucas & Kanade at most; px of a step that ends them
+STEPS = 40  # iterations of Lucas & Kanade, at most
+SMALL = 0.003  # px of a step that ends them
 SEARCH = (1, 32)  # px, Herath et al. (2007) sec. 3.4
 STEP = 16  # OpenCV's matchers search a multiple of this many disparities, in sixteenths of a px
 PATCH = 15  # px, side of the patches that are compared
@@ -47,7 +48,9 @@ class GoodFeatures:
         mask = np.zeros(image.shape, np.uint8)
         mask[int(MARGIN) : -int(MARGIN), int(MARGIN) : -int(MARGIN)] = 1
         found = opencv().goodFeaturesToTrack(image, self.count, self.quality, self.distance, mask=mask, blockSize=BLOCK)
-        return np.empty((0, 2)) if found is None else from_columns(image, found.reshape(-1, 2).astype(float))
+        if found is None:
+            return np.empty((0, 2))
+        return from_columns(image, found.reshape(-1, 2).astype(float))
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,9 @@ class Spread:
     def choose(self, image: Array) -> Array:
         uv = GoodFeatures(0, self.quality, self.distance).choose(image)  # 0: all of them
         shape = np.array([self.columns, self.rows])
-        cell = np.clip(((uv / image.shape[::-1] + 0.5) * shape).astype(int), 0, shape - 1) @ [1, self.columns]
-        turn = np.array([np.count_nonzero(cell[:i] == own) for i, own in enumerate(cell)], int)
+        place = ((uv / image.shape[::-1] + 0.5) * shape).astype(int)
+        cell = np.clip(place, 0, shape - 1) @ [1, self.columns]
+        turn = np.tril(cell[:, None] == cell, -1).sum(axis=1)  # how many of its cell are stronger
         return uv[np.argsort(turn, kind="stable")[: self.count]]
 
 
@@ -202,7 +206,8 @@ def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
     """
     height, width = disparities.shape
     column, row = np.rint(places).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = (column >= 0) & (column < width)
+    inside &= (row >= 0) & (row < height)
     d = np.full(len(places), np.nan)
     d[inside] = disparities[row[inside], column[inside]] / STEP
     d[(d <= search[0]) | (d >= search[1])] = np.nan
@@ -273,8 +278,9 @@ class KltAcross:
         tracker = Klt(self.window, self.levels)
         there, found = tracker.follow(left, right, uv, uv)
         d = uv[:, 0] - there[:, 0]
-        good = found & (np.abs(uv[:, 1] - there[:, 1]) <= self.rows) & (d >= self.search[0]) & (d <= self.search[1])
-        return np.where(good, d, np.nan)
+        found &= np.abs(uv[:, 1] - there[:, 1]) <= self.rows
+        found &= (d >= self.search[0]) & (d <= self.search[1])
+        return np.where(found, d, np.nan)
 
 
 @dataclass(frozen=True)
@@ -319,7 +325,8 @@ class LeftRightCheck:
 
     def keep(self, evidence: PairObservations) -> Array:
         """The right image is searched from its mirror image, in which it is the left one."""
-        left, right = (np.ascontiguousarray(image[:, ::-1]) for image in (evidence.right, evidence.left))
+        left = np.ascontiguousarray(evidence.right[:, ::-1])
+        right = np.ascontiguousarray(evidence.left[:, ::-1])
         own = np.where(np.isfinite(evidence.d), evidence.d, 0.0)
         there = np.stack([own - evidence.uv[:, 0], evidence.uv[:, 1]], axis=-1)
         back = evidence.correspondence.measure(left, right, there)

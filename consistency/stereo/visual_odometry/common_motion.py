@@ -151,29 +151,22 @@ def _error_and_slope(
 def _points(z: Array, sensor: BelievedSensor) -> Array:
     """Observations (n, s) as points in the robot frame (n, 3), m; those of a sensor in the plane have height 0."""
     if sensor.model == "uvd":
-        assert sensor.f is not None
-        assert sensor.B is not None
-        u, v, d = z.T
-        at = stereo.triangulate(u, v, d, sensor.f, sensor.B)
+        at = stereo.triangulate(*z.T, *sensor.rig)
     elif sensor.model == "range-bearing":
         at = *planar.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
     else:
-        x, y, height = np.pad(z, ((0, 0), (0, 3 - sensor.size))).T
-        at = x, y, height
+        at = tuple(np.pad(z, ((0, 0), (0, 3 - sensor.size))).T)
     return np.column_stack(point.from_sensor(*at, sensor.mount.packed()))
 
 
 def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
     """Observations (n, s) of points (n, 3) in the robot frame, and their derivative (n, s, 3)."""
     mount = sensor.mount.packed()
-    bx, by, bz = points.T
-    x, y, z = point.to_sensor(bx, by, bz, mount)
+    x, y, z = point.to_sensor(*points.T, mount)
     if sensor.model == "uvd":
-        assert sensor.f is not None
-        assert sensor.B is not None
         x = np.maximum(x, NEAREST)
-        seen = np.column_stack(stereo.project(x, y, z, sensor.f, sensor.B))
-        slope = np.array(stereo.project_jacobian(x, y, z, sensor.f, sensor.B)).reshape(3, 3, -1)
+        seen = np.column_stack(stereo.project(x, y, z, *sensor.rig))
+        slope = np.array(stereo.project_jacobian(x, y, z, *sensor.rig)).reshape(3, 3, -1)
     elif sensor.model == "range-bearing":
         seen = np.column_stack(planar.range_bearing(x, y))
         flat = np.array(planar.range_bearing_jacobian(x, y)).reshape(2, 2, -1)

@@ -17,6 +17,7 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, in_px, rectify
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
@@ -42,6 +43,14 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self.left)
+
+    @property
+    def uvd_rig(self) -> StereoRig:
+        """The rig of the rectified images, side by side as the cameras of a sensor ``uvd``; else InputError."""
+        rig = self.rectification.rig
+        if not is_rectified(rig):
+            raise InputError(f"{self.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+        return rig
 
     def pair(self, frame: int) -> tuple[Array, Array]:
         """Rectified grey images (h, w) of a frame.

@@ -26,17 +26,12 @@ class TwoFrames:
     W1: Array  # (N, k, k), inverse covariance
     W2: Array  # (N, k, k)
 
-    def residuals(self, pose: RelativePose, q: Array) -> tuple[Array, Array]:
-        """e1 and e2, (N, k) each."""
-        return self.z1 - self.measure.value(pose.apply(q)), self.z2 - self.measure.value(q)
-
     def squared(self, pose: RelativePose, q: Array) -> Array:
         """2 f of each point, (N,), infinite where a point is not in front of the cameras."""
+        e1 = self.z1 - self.measure.value(pose.apply(q))
+        e2 = self.z2 - self.measure.value(q)
         with np.errstate(invalid="ignore"):
-            s = sum(
-                np.einsum("ni,nij,nj->n", e, W, e)
-                for e, W in zip(self.residuals(pose, q), (self.W1, self.W2), strict=True)
-            )
+            s = np.einsum("ni,nij,nj->n", e1, self.W1, e1) + np.einsum("ni,nij,nj->n", e2, self.W2, e2)
         return np.where(np.isnan(s), np.inf, s)
 
 

@@ -90,7 +90,7 @@ def estimate_bias(
             continue
         b = beta[known]
         S = C[np.ix_(known, known)]
-        p_value[k] = float(stats.chi2.sf(b @ np.linalg.solve(S, b), len(b)))
+        p_value[k] = stats.chi2.sf(b @ np.linalg.solve(S, b), len(b))
         if p_value[k] < rate:
             believed[k, known] = shrunken(b, S)
     return BiasEstimate(grid, value, half, p_value, p_value < rate, believed)
@@ -107,8 +107,10 @@ def shrunken(b: Array, S: Array) -> Array:
 
     def negative(log_w: float) -> float:
         variance = np.exp(2.0 * log_w) + values
-        return float(0.5 * (np.log(variance) + along**2 / variance).sum())
+        return 0.5 * (np.log(variance) + along**2 / variance).sum()
 
-    top = np.log(np.abs(b).max() + np.sqrt(values.max()) + 1e-9) + 1.0
-    w2 = np.exp(2.0 * optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded").x)
+    largest = np.abs(b).max() + np.sqrt(values.max()) + 1e-9
+    top = np.log(largest) + 1.0
+    best = optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded")
+    w2 = np.exp(2.0 * best.x)
     return axes @ (along * w2 / (w2 + values))

@@ -101,7 +101,8 @@ def find_corners(folder: Path, board: Size, square: float) -> Corners:
         )
     down, across = np.indices(board[::-1])
     points = square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
-    return Corners(np.array(lefts), np.array(rights), points, names, missed, (int(size[0]), int(size[1])))
+    width, height = size
+    return Corners(np.array(lefts), np.array(rights), points, names, missed, (width, height))
 
 
 def pairs_of(folder: Path) -> list[tuple[Path, Path]]:
@@ -278,12 +279,14 @@ def residuals_about_boards(calibrated: Calibrated, board: Array) -> Residuals:
     for _ in range(ROUNDS):
         for k, pair in enumerate(z):
             poses[k], ideal[k] = _fitted(pair, board, calibrated, poses[k], sigma)
-        sigma = np.maximum(np.sqrt(np.mean((z - ideal) ** 2, axis=(0, 1))), 1e-6)
+        rms = np.sqrt(np.mean((z - ideal) ** 2, axis=(0, 1)))
+        sigma = np.maximum(rms, 1e-6)
     paid = 1.0 - (POSE * n + calibrated.fitted) / (3.0 * n * count)
     r = (z - ideal) / np.sqrt(paid)
     track = np.repeat(np.arange(n), count)
     step = np.tile(np.arange(count), n)
-    return Residuals(r.reshape(-1, 3), ideal.reshape(-1, 3), track, step, np.zeros(n * count, bool))
+    moving = np.zeros(n * count, bool)
+    return Residuals(r.reshape(-1, 3), ideal.reshape(-1, 3), track, step, moving)
 
 
 def _project(pose: Array, board: Array, calibrated: Calibrated) -> Array:
@@ -297,8 +300,10 @@ def _first_pose(z: Array, board: Array, calibrated: Calibrated) -> Array:
     """The pose that lays the board best on the triangulated corners, Arun et al. (1987)."""
     u, v, d = z.T
     seen = np.stack(stereo.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
-    turn, _ = Rotation.align_vectors(seen - seen.mean(axis=0), board - board.mean(axis=0))
-    return np.concatenate([turn.as_rotvec(), seen.mean(axis=0) - turn.apply(board.mean(axis=0))])
+    middle = seen.mean(axis=0)
+    middle_of_board = board.mean(axis=0)
+    turn, _ = Rotation.align_vectors(seen - middle, board - middle_of_board)
+    return np.concatenate([turn.as_rotvec(), middle - turn.apply(middle_of_board)])
 
 
 def _fitted(

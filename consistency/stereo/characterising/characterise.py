@@ -51,7 +51,7 @@ class Coordinate:
         """Standard deviation of the offsets of tracks, px."""
         if self.offset is None:
             return float("nan")
-        return float(self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12)))
+        return self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12))
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def characterise(
     def fitted(k: int, G: Array) -> LikelihoodFit:
         rows = Rows(kept.r[:, k], X, G, kept.first, kept.gap, cells.ridge)
         try:
-            return fit(rows, float(chosen.rough[k]), memory=rows.length >= SHORTEST and not alone)
+            return fit(rows, chosen.rough[k], memory=rows.length >= SHORTEST and not alone)
         except ValueError as error:
             raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
 
@@ -173,10 +173,11 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
 
 
 def _coordinate(k: int, of: LikelihoodFit, levels: Levels) -> Coordinate:
-    rows = of.rows
-    r = rows.r
-    n = np.diff(np.append(rows.first, len(r)))
-    centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
+    r = of.rows.r
+    track = of.rows.track
+    n = np.bincount(track)
+    centred = r - (np.bincount(track, r) / n)[track]
+    spare = max(len(r) - len(n), 1)
     correlation = None
     offset = None
     if of.memory:
@@ -187,8 +188,8 @@ def _coordinate(k: int, of: LikelihoodFit, levels: Levels) -> Coordinate:
     return Coordinate(
         NAMES[k],
         sigma=coordinate_fit.noise_interval(of, levels.of("sigma")),
-        pooled=float(r.std(ddof=1)),
-        about_tracks=float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
+        pooled=r.std(ddof=1),
+        about_tracks=np.sqrt((centred**2).sum() / spare),
         correlation=correlation,
         offset=offset,
         tails=tails(w, levels.of("tails")),

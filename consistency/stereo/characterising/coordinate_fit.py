@@ -63,7 +63,7 @@ def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
     """Half of an interval of ``gradient' theta``."""
     gaussian = np.sqrt(max(gradient @ fit.cov @ gradient, 0.0))
     any_noise = np.sqrt(max(gradient @ fit.robust @ gradient, 0.0))
-    return float(wider(gaussian, any_noise, fit.tracks, level))
+    return wider(gaussian, any_noise, fit.tracks, level)
 
 
 def parameter_half_width(k: int, fit: LikelihoodFit, level: float) -> float:
@@ -77,7 +77,8 @@ def noise_interval(fit: LikelihoodFit, level: float) -> Interval:
     G = fit.rows.G
     sd = G @ a
     mean_square = np.mean(sd**2)
-    gradient = np.append((sd[:, None] * G).mean(axis=0) * a / mean_square, [0.0, 0.0])
+    by_a = (sd[:, None] * G).mean(axis=0) * a / mean_square
+    gradient = np.append(by_a, [0.0, 0.0])
     return interval_on_scale(np.exp, 0.5 * np.log(mean_square), half_width(gradient, fit, level))
 
 
@@ -100,7 +101,7 @@ def growth_p_value(fit: LikelihoodFit) -> float:
     values = []
     for C in (fit.cov, fit.robust):
         S = contrast @ C[:m, :m] @ contrast.T
-        values.append(float(stats.chi2.sf(gap @ np.linalg.solve(S, gap), m - 1)))
+        values.append(stats.chi2.sf(gap @ np.linalg.solve(S, gap), m - 1))
     return max(values)
 
 
@@ -130,7 +131,8 @@ def bias_coefficients(fit: LikelihoodFit, level: float) -> tuple[Array, Array, A
     gaussian = np.sqrt(np.diag(of.cov))
     any_noise = np.sqrt(np.maximum(np.diag(robust), 0.0))
     factor = np.maximum(any_noise / gaussian, 1.0)
-    return of.beta, wider(gaussian, any_noise, K, level), of.cov * factor[:, None] * factor[None, :]
+    half = wider(gaussian, any_noise, K, level)
+    return of.beta, half, of.cov * np.outer(factor, factor)
 
 
 def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
@@ -149,8 +151,9 @@ def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
     values = np.full(LAGS, np.nan)
     bounds = np.full(LAGS, np.nan)
     for lag in range(1, LAGS + 1):
-        together = (track[lag:] == track[:-lag]) & (place[lag:] - place[:-lag] == lag)
-        before = np.flatnonzero(together)
+        same_track = track[lag:] == track[:-lag]
+        in_step = place[lag:] - place[:-lag] == lag
+        before = np.flatnonzero(same_track & in_step)
         if len(before) < FEWEST_PAIRS:
             break
         given_back = (1.0 / n[track[before]]).mean()
@@ -193,22 +196,22 @@ def tails(w: Array, level: float) -> ResidualTails:
         return 2.0 * optimize.minimize_scalar(negative, bounds=(-1.5, 0.5), method="bounded").fun
 
     best = optimize.minimize_scalar(deviance, bounds=(0.0, HEAVIEST), method="bounded", options={"xatol": 1e-5})
-    value = float(best.x)
-    least = float(best.fun)
+    value = best.x
+    least = best.fun
     if deviance(0.0) <= least:
         value = 0.0
         least = deviance(0.0)
-    limit = least + float(stats.chi2.isf(level, 1))
+    limit = least + stats.chi2.isf(level, 1)
 
     def beyond(weight: float) -> float:
         return deviance(weight) - limit
 
     low = 0.0
     if beyond(0.0) > 0:
-        low = float(optimize.brentq(beyond, 0.0, value))
+        low = optimize.brentq(beyond, 0.0, value)
     high = HEAVIEST
     if beyond(HEAVIEST) > 0:
-        high = float(optimize.brentq(beyond, value, HEAVIEST))
+        high = optimize.brentq(beyond, value, HEAVIEST)
     shape = normality(w)
     better = None
     if low > 0:
@@ -231,16 +234,16 @@ def two_normals(w: Array) -> tuple[Mixture, float]:
         core = _weighted_sd(w, 1.0 - of_wide)
         wide = _weighted_sd(w, of_wide)
         before = share
-        share = float(of_wide.mean())
+        share = of_wide.mean()
         if abs(share - before) < 1e-7:
             break
     total = (1.0 - share) * _normal(w, core) + share * _normal(w, wide)
-    return Mixture(share, core, wide), float(-np.log(total).sum())
+    return Mixture(share, core, wide), -np.log(total).sum()
 
 
 def _weighted_sd(w: Array, weight: Array) -> float:
     """Standard deviation about zero."""
-    return float(np.sqrt((weight * w**2).sum() / max(weight.sum(), 1e-9)))
+    return np.sqrt((weight * w**2).sum() / max(weight.sum(), 1e-9))
 
 
 def _normal(w: Array, sd: float) -> Array:
@@ -251,10 +254,11 @@ def _negative(w: Array, weight: float, log_scale: float) -> float:
     """Negative log-likelihood of Student's distribution with 1 / weight degrees of freedom and a scale."""
     x2 = np.exp(-2.0 * log_scale) * w**2
     if weight < 1e-4:
-        return float(0.5 * x2.sum() + len(w) * (log_scale + 0.5 * np.log(2.0 * np.pi)))
+        return 0.5 * x2.sum() + len(w) * (log_scale + 0.5 * np.log(2.0 * np.pi))
     nu = 1.0 / weight
-    constant = special.gammaln((nu + 1.0) / 2.0) - special.gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
-    return float(0.5 * (nu + 1.0) * np.log1p(x2 / nu).sum() + len(w) * (log_scale - constant))
+    constant = special.gammaln((nu + 1.0) / 2.0) - special.gammaln(nu / 2.0)
+    constant -= 0.5 * np.log(nu * np.pi)
+    return 0.5 * (nu + 1.0) * np.log1p(x2 / nu).sum() + len(w) * (log_scale - constant)
 
 
 def rate(count: int, total: int, level: float) -> Interval:
@@ -297,4 +301,5 @@ def _log_sd(w: Array, weight: Array, track: Array) -> tuple[float, float]:
     mean = (weight * w**2).sum() / dof
     _, where = np.unique(track, return_inverse=True)
     of_tracks = np.bincount(where, weight * (w**2 / mean - 1.0))
-    return 0.5 * np.log(mean), 0.25 * max((of_tracks**2).sum() / dof**2, 2.0 / dof)
+    variance = max((of_tracks**2).sum() / dof**2, 2.0 / dof)
+    return 0.5 * np.log(mean), 0.25 * variance

@@ -149,7 +149,8 @@ def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None
         order = order[rest_of_row[order] >= 0]
         step = trial.step[order]
         R, t = _sensor_poses(pose, mount)
-        parts.append((trial.z[order], R[step], t[step], tracks + track[order], step, moved_before(pose)[step]))
+        moving = moved_before(pose)
+        parts.append((trial.z[order], R[step], t[step], tracks + track[order], step, moving[step]))
         tracks += trial.n_landmarks * (int(rest.max()) + 1)
     return Seen(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -159,16 +160,17 @@ def _in_space(trial: Trial, path: Path) -> Seen:
     lines = read_trajectory(path, true=True)
     if len(lines.values) != trial.steps + 1:
         raise InputError(f"{path}: {len(lines.values)} poses for steps 0 to {trial.steps}; must hold one for each")
-    turns = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA
-    place = lines.values[:, 1:4]
+    R = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA
+    t = lines.values[:, 1:4]
     order = np.lexsort((trial.step, trial.landmark))
-    rows = trial.step[order]
-    return Seen(trial.z[order], turns[rows], place[rows], trial.landmark[order], rows, np.ones(len(rows), bool))
+    step = trial.step[order]
+    moving = np.ones(len(step), bool)
+    return Seen(trial.z[order], R[step], t[step], trial.landmark[order], step, moving)
 
 
 def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:
     """Rotation (T + 1, 3, 3) and place (T + 1, 3) of the sensor in the world from poses on the plane."""
-    turns = Rotation.from_euler("z", pose[:, 2]).as_matrix()
+    turns = Rotation.from_euler("z", pose[:, 2:]).as_matrix()
     place = np.pad(pose[:, :2], ((0, 0), (0, 1)))
     return turns @ rotation(*mount.rotation), place + turns @ np.array(mount.position)
 

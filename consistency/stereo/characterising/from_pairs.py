@@ -58,7 +58,8 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
 def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
     """Poses (n, 3, 3), (n, 3) of the left camera; equal poses at rest."""
     if options.at_rest:
-        return np.broadcast_to(np.eye(3), (len(sequence), 3, 3)), np.zeros((len(sequence), 3))
+        n = len(sequence)
+        return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
     path = options.truth or find_truth(sequence)
     if path is None:
         raise InputError(
@@ -97,7 +98,8 @@ def _seen(
 def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:
     """A note on the rows of matches, which should be equal in both images."""
     pixels = np.concatenate([m.uv1[m.inliers] for m in motions])
-    gap = pixels[:, 1] - pixels[:, 3] - (rig.K_left[1, 2] - rig.K_right[1, 2])
+    _, v_left, _, v_right = pixels.T
+    gap = v_left - v_right - (rig.K_left[1, 2] - rig.K_right[1, 2])
     return (
         f"v_left - v_right of {len(gap)} matches: mean {gap.mean():+.3f} px, an error of the rectification; robust sd "
         f"{robust_sd(gap):.3f} px."

@@ -139,15 +139,15 @@ def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple
     The wider of two: chi-square with the degrees of freedom that are left, for Gaussian noise, and the scatter of the
     tracks' sums of squares, for any noise.
     """
-    dof = float(of.free[chosen].sum())
+    dof = of.free[chosen].sum()
     excess = np.where(chosen, of.r**2 - sigma**2 * of.free, 0.0).sum(axis=1)
     of_tracks = of.sums_of_tracks(excess)
     tracks = np.count_nonzero(of.sums_of_tracks(chosen.any(axis=1)))
     gaussian = np.sqrt(0.5 / dof)
     any_noise = 0.5 * np.sqrt((of_tracks**2).sum()) / (dof * sigma**2)
-    half = float(wider(gaussian, any_noise, tracks, level))
+    half = wider(gaussian, any_noise, tracks, level)
     interval = interval_on_scale(lambda log: sigma * np.exp(log), 0.0, half)
-    return interval, float(max(gaussian, any_noise) ** 2)
+    return interval, max(gaussian, any_noise) ** 2
 
 
 def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
@@ -155,18 +155,18 @@ def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
     weights = np.empty(len(nodes))
     for j in range(len(nodes)):
         part = 2 + j
-        interval, variance = log_interval(of, of.parts == part, float(of.sigma[part]), levels.of("growth"))
+        interval, variance = log_interval(of, of.parts == part, of.sigma[part], levels.of("growth"))
         intervals.append(interval)
         weights[j] = 1.0 / variance
     logs = np.log(of.sigma[2:])
     mean = (logs * weights).sum() / weights.sum()
     chi2 = ((logs - mean) ** 2 * weights).sum()
-    p_value = float(stats.chi2.sf(chi2, len(nodes) - 1))
+    p_value = stats.chi2.sf(chi2, len(nodes) - 1)
     return DisparityNoise(nodes, tuple(intervals), p_value, p_value < levels.rate / 6)
 
 
 def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate:
-    interval, _ = log_interval(plain, plain.parts == k, float(plain.sigma[k]), levels.of("sigma"))
+    interval, _ = log_interval(plain, plain.parts == k, plain.sigma[k], levels.of("sigma"))
     scaled = of.scaled[of.free[:, k] > FREE, k]
     lags, bounds, correlation = correlations(of, k, levels.of("correlation"))
     return Coordinate(
@@ -192,18 +192,22 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interv
     lags = np.full(LAGS, np.nan)
     bounds = np.full(LAGS, np.nan)
     seen = of.seen
-    pair = 1 + np.flatnonzero((np.diff(seen.track) == 0) & (np.diff(seen.step) == 1))
+    same_track = np.diff(seen.track) == 0
+    next_step = np.diff(seen.step) == 1
+    pair = 1 + np.flatnonzero(same_track & next_step)
     if len(pair) < FEWEST_PAIRS:
         return lags, bounds, None
     sigma = of.sigma[of.parts[:, k]]
     e = of.r[:, k] / sigma
-    products = e[pair] * e[pair - 1] - (of.neighbours[:, k] / sigma**2)[pair]
-    weight = np.sqrt(np.maximum(of.free[pair, k] * of.free[pair - 1, k], 0.0))
-    value = float(products.sum() / weight.sum())
+    free = of.free[:, k]
+    by_fit = of.neighbours[:, k] / sigma**2
+    products = e[pair] * e[pair - 1] - by_fit[pair]
+    weight = np.sqrt(np.maximum(free[pair] * free[pair - 1], 0.0))
+    value = products.sum() / weight.sum()
     _, where = np.unique(seen.track[pair], return_inverse=True)
     of_tracks = np.bincount(where, products - value * weight)
-    error = float(np.sqrt((of_tracks**2).sum()) / weight.sum())
-    half = error * float(stats.t.isf(level / 2, max(where.max(), 1)))
+    error = np.sqrt((of_tracks**2).sum()) / weight.sum()
+    half = error * stats.t.isf(level / 2, max(where.max(), 1))
     lags[0] = value
     bounds[0] = 1.96 * error
     return lags, bounds, Interval(value, max(value - half, -1.0), min(value + half, 1.0))
@@ -212,7 +216,7 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interv
 def _shared(of: Fitted, free_poses: bool) -> tuple[str, ...]:
     """A note on what all landmarks of a step have in common, which is the poses' or the rig's and not the noise's."""
     _, where, count = np.unique(of.seen.step, return_inverse=True, return_counts=True)
-    pairs = float((count * (count - 1)).sum())
+    pairs = (count * (count - 1)).sum()
     if pairs < 1 or len(count) < 3:
         return ()
     shared = np.zeros(3)

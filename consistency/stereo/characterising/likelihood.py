@@ -37,14 +37,13 @@ class Rows:
     @property
     def length(self) -> float:
         """Rows of a track that its offset is averaged over, the mean that an analysis of variance has."""
-        n = np.diff(np.append(self.first, len(self.r)))
-        return float((n.sum() - (n**2).sum() / n.sum()) / max(len(n) - 1, 1))
+        n = np.bincount(self.track)
+        return (len(self.r) - (n**2).sum() / len(self.r)) / max(len(n) - 1, 1)
 
     @property
     def track(self) -> Indices:
         """Number of the track of each row, (N,)."""
-        n = np.diff(np.append(self.first, len(self.r)))
-        return np.repeat(np.arange(len(n)), n)
+        return np.searchsorted(self.first, np.arange(len(self.r)), side="right") - 1
 
 
 @dataclass(frozen=True)
@@ -69,20 +68,20 @@ def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
     sd = rows.G @ p.a
     if abs(p.rho) > MOST or not (sd > 0).all():
         return None
-    root = np.sqrt(np.mean(sd**2) * abs(p.ratio)) * np.sign(p.ratio)
+    root = np.sqrt(np.mean(sd**2) * abs(p.ratio))
     x = np.column_stack([columns, np.ones(len(sd))]) / sd[:, None]
     decay = np.where(rows.gap > 0, p.rho ** np.maximum(rows.gap, 1), 0.0)
     left = 1.0 - decay**2
     x[1:] -= decay[1:, None] * x[:-1]
     x /= np.sqrt(left)[:, None]
-    one = x[:, -1:] * abs(root)
-    energy = np.sign(root) * np.add.reduceat(one[:, 0] ** 2, rows.first)
+    one = x[:, -1:] * root
+    size = np.add.reduceat(one[:, 0] ** 2, rows.first)
+    energy = np.sign(p.ratio) * size
     if (energy <= -1.0).any():
         return None
     log_variance = np.add.reduceat(2.0 * np.log(sd) + np.log(left), rows.first) + np.log1p(energy)
     x = x[:, :-1]
-    if root != 0.0:  # (I - k c c')^2 is the inverse of I + s c c'
-        size = np.add.reduceat(one[:, 0] ** 2, rows.first)
+    if root > 0.0:  # (I - k c c')^2 is the inverse of I + s c c'
         k = (1.0 - 1.0 / np.sqrt(1.0 + energy)) / np.maximum(size, 1e-300)
         along = np.add.reduceat(one * x, rows.first, axis=0) * k[:, None]
         x -= one * along[rows.track]
@@ -114,8 +113,9 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
         return None
     beta = np.linalg.solve(normal, X.T @ y)
     e = y - X @ beta
-    value = -0.5 * (white.log_variance.sum() + 2.0 * np.log(np.diag(factor)).sum() + e @ e + rows.ridge @ beta**2)
-    return Regression(beta, np.linalg.inv(normal), e, X, float(value))
+    log_det = white.log_variance.sum() + 2.0 * np.log(np.diag(factor)).sum()
+    value = -0.5 * (log_det + e @ e + rows.ridge @ beta**2)
+    return Regression(beta, np.linalg.inv(normal), e, X, value)
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ class Likelihood:
         nodes = self.rows.G.shape[1]
         if not self.memory:
             return Parameters(np.exp(x), 0.0, 0.0)
-        rho = float(np.tanh(x[nodes]))
-        ratio = float(np.expm1(x[nodes + 1]) / max(self.rows.length, 1.0))
+        rho = np.tanh(x[nodes])
+        ratio = np.expm1(x[nodes + 1]) / max(self.rows.length, 1.0)
         return Parameters(np.exp(x[:nodes]), rho, ratio)
 
     def restricted(self, x: Array) -> float:
@@ -163,7 +163,7 @@ class Likelihood:
         white = whiten_rows(self.rows, r, self.parameters(x))
         if white is None:
             return IMPOSSIBLE
-        return 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
+        return 0.5 * (white.log_variance.sum() + (white.values**2).sum())
 
     def of_tracks(self, x: Array, r: Array) -> Array:
         """Log-likelihood (K,) of the residuals (N, 1) of each track, likewise."""

@@ -97,7 +97,8 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
 
 def moved_before(poses: Array) -> Array:
     """Whether poses (T + 1, 3) differ from the one before, (T + 1,) of bool."""
-    return np.append(False, np.abs(np.diff(poses, axis=0)).max(axis=1) > 0.0)
+    moved = (np.diff(poses, axis=0) != 0.0).any(axis=1)
+    return np.append(False, moved)
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ def _robust(r: Array, X: Array) -> Array:
     beta = np.full(X.shape[1], np.median(r))
     for _ in range(10):
         e = r - X @ beta
-        weight = np.minimum(1.0, HUBER * robust_sd(e) / np.maximum(np.abs(e), 1e-12))
+        limit = HUBER * robust_sd(e)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(e), 1e-12))
         normal = (X * weight[:, None]).T @ X + 1e-3 * np.eye(X.shape[1])
         beta = np.linalg.solve(normal, X.T @ (weight * r))
     return X @ beta
@@ -159,7 +161,7 @@ def _robust(r: Array, X: Array) -> Array:
 
 def robust_sd(e: Array) -> float:
     """Robust standard deviation of a sample."""
-    return max(MAD * float(np.median(np.abs(e - np.median(e)))), 1e-9)
+    return max(MAD * np.median(np.abs(e - np.median(e))), 1e-9)
 
 
 def _local_spread(e: Array, data: Residuals) -> Array:

@@ -104,7 +104,7 @@ def _bias(bias: BiasEstimate) -> str:
     if known < total:
         unknown = f" {total - known} of {total} nodes of the map have too few data and are zero."
     if not bias.shown.any():
-        widest = float(np.nanmedian(bias.half))
+        widest = np.nanmedian(bias.half)
         return f"No bias over the image is shown; the median interval of a node is ±{widest:.2g} px.{unknown}"
     shown = []
     hidden = []

@@ -188,7 +188,8 @@ def slopes_of(
     x = np.maximum(x, NEAREST)
     predicted = np.stack(stereo.project(x, y, w, f, B), axis=-1)
     zero = np.zeros_like(x)
-    J = np.stack(stereo.project_jacobian(x, y, w, f, B), axis=-1).reshape(*x.shape, 3, 3) / sigma[..., None]
+    entries = np.stack(stereo.project_jacobian(x, y, w, f, B), axis=-1)
+    J = entries.reshape(*x.shape, 3, 3) / sigma[..., None]
     by_point = J @ np.swapaxes(R, -1, -2)
     turned = np.stack([zero, -w, y, w, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
     by_pose = np.concatenate([-J, J @ turned], axis=-1)
@@ -212,7 +213,9 @@ def step_of_points(s: Slopes) -> Step:
     r = s.r - np.einsum("tnci,ti->tnc", s.by_point, move)
     free = 1.0 - np.einsum("tnci,tij,tncj->tnc", s.by_point, s.cov, s.by_point)
     neighbours = np.zeros_like(r)
-    neighbours[:, 1:] = -np.einsum("tnci,tij,tncj->tnc", s.by_point[:, 1:], s.cov, s.by_point[:, :-1])
+    own = s.by_point[:, 1:]
+    before = s.by_point[:, :-1]
+    neighbours[:, 1:] = -np.einsum("tnci,tij,tncj->tnc", own, s.cov, before)
     return Step(move, r, free, neighbours)
 
 

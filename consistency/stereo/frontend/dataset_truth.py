@@ -119,13 +119,17 @@ def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     before = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
     after = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
     poses = np.stack([before, *poses, after])
-    known = np.array([2 * stamps[0] - stamps[1], *stamps, 2 * stamps[-1] - stamps[-2]]) - start
+    first = 2 * stamps[0] - stamps[1]
+    last = 2 * stamps[-1] - stamps[-2]
+    known = np.array([first, *stamps, last]) - start
     far = np.abs(t[:, None] - known[1:-1]).min(axis=1) > PACKET_DT / NANO
     far |= (t < known[0]) | (t > known[-1])
     if far.any():
         raise InputError(f"{path}: {far.sum()} of {len(t)} frames have no packet within {PACKET_DT:g} s")
     turn = Slerp(known, Rotation.from_matrix(poses[:, :3, :3]))(t).as_matrix()
-    place = np.column_stack([np.interp(t, known, column) for column in poses[:, :3, 3].T])
+    place = np.empty((len(t), 3))
+    for k in range(3):
+        place[:, k] = np.interp(t, known, poses[:, k, 3])
     return _of_camera(turn, place, sequence)
 
 
@@ -133,7 +137,8 @@ def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     rows = read_number_table(path, ",", NO_TABLE)
     if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
         raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
-    if (np.abs(np.linalg.norm(rows[:, 4:8], axis=1) - 1.0) > UNIT).any():
+    length = np.linalg.norm(rows[:, 4:8], axis=1)
+    if (np.abs(length - 1.0) > UNIT).any():
         raise InputError(f"{path}: columns 5 to 8 must be a quaternion w x y z of length 1")
     if sequence.calibration.body != EUROC_BODY:
         raise InputError(f"{path}: is the truth of a body, but {sequence.calibration.source} has no T_BS to the camera")

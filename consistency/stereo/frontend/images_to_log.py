@@ -81,7 +81,7 @@ class Summary:
             lines.append(self.plane.line)
         lines += self._log_lines(out)
         if not self.sequence.timed:
-            rate = len(motions) / float(stamps[-1] - stamps[0])
+            rate = len(motions) / (stamps[-1] - stamps[0])
             lines.append(f"the images have no times: {rate:g} Hz assumed, --rate says otherwise")
         return lines + self._truth_lines(out)
 

@@ -30,7 +30,13 @@ NEAR = 10.0  # standard deviations of its disparity that a landmark has at least
 MOST_SLOTS = 64  # landmarks at once
 # rad: as many such tilts, at random, come to 1 / NEAR within a landmark's life
 LEAVES = 1.0 / (NEAR * np.sqrt(MAX_AGE))
-CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, forward <- forward, left, up
+CAMERA = np.array(  # right, down, forward <- forward, left, up
+    [
+        [0.0, -1.0, 0.0],
+        [0.0, 0.0, -1.0],
+        [1.0, 0.0, 0.0],
+    ]
+)
 WITHIN = 30.0  # degrees between optical axis and motion; a camera that looks elsewhere does not tell what is forward
 MOVED = 0.1  # m over the whole sequence; below, a rig that stands still has no direction
 
@@ -86,11 +92,12 @@ def plane_of(motions: list[RelativeMotion], trial: Trial, belief: Belief) -> Pla
     """What of ``motions`` the planar log that :func:`log_of` makes of them leaves out."""
     R, t = stacked(motions)
     turn, _ = in_robot_axes(R, t, robot_axes(t), 0.0)
-    tilts = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec()[:, :2], axis=1)
+    roll, pitch, _ = Rotation.from_matrix(turn).as_rotvec().T
     sensor = belief.sensor
     u, v, d = sensor.sigma
-    wide = sensor.rig[0] / NEAR
-    return Plane((u, v, d), (wide, wide, float(np.median(trial.z[:, 2])) / NEAR), tilts)
+    f, _ = sensor.rig
+    disparity = float(np.median(trial.z[:, 2]))
+    return Plane((u, v, d), (f / NEAR, f / NEAR, disparity / NEAR), np.hypot(roll, pitch))
 
 
 def stacked(motions: list[RelativeMotion]) -> tuple[Array, Array]:
@@ -154,11 +161,13 @@ def observations(rig: StereoRig, motions: list[RelativeMotion]) -> pd.DataFrame:
     pieces = linked([m.rows[m.inliers] for m in motions])
     parts = []
     tracks = 0
-    for step, (m, piece) in enumerate(zip(motions, pieces, strict=True), start=1):
+    for step, (motion, piece) in enumerate(zip(motions, pieces, strict=True), start=1):
+        good = motion.inliers
+        before = _sights(rig, motion.uv0[good], motion.sigma0[good], piece, step - 1)
+        after = _sights(rig, motion.uv1[good], motion.sigma1[good], piece, step)
         new = piece >= tracks  # tracks are numbered in the order in which they begin
         tracks += np.count_nonzero(new)
-        parts.append(_sights(rig, m.uv0[m.inliers], m.sigma0[m.inliers], piece, step - 1)[new])
-        parts.append(_sights(rig, m.uv1[m.inliers], m.sigma1[m.inliers], piece, step))
+        parts += [before[new], after]
     return pd.concat(parts).sort_values(["piece", "step"], ignore_index=True)
 
 
@@ -188,7 +197,8 @@ def selected(rows: pd.DataFrame, most: int, width: int) -> pd.DataFrame:
     rows = rows[rows["z2"] >= NEAR * rows["sigma"]]
     if rows.empty:
         raise InputError(f"no match has a disparity of at least {NEAR:g} of its sigmas; the scene is too far for a log")
-    rows = rows.assign(piece=np.cumsum((rows["piece"].diff() != 0) | (rows["step"].diff() != 1)))
+    begins = (rows["piece"].diff() != 0) | (rows["step"].diff() != 1)
+    rows = rows.assign(piece=begins.cumsum())
 
     def selection_of(slots: int) -> pd.DataFrame:
         return thinned(rows, TrackSelection(slots, MAX_AGE, MIN_LIFE, BANDS, float(width)))
@@ -300,13 +310,15 @@ def planar_motions(R: Array, t: Array) -> Array:
 
     Height, roll and pitch are left out step by step: a slope is unrolled, nothing of it adds up.
     """
-    return np.column_stack([t[:, :2], np.arctan2(R[:, 1, 0], R[:, 0, 0])])
+    turn = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    return np.column_stack([t[:, :2], turn])
 
 
 def planar_path(motions: Array) -> Array:
     """Poses x, y, heading (T + 1, 3) from :func:`planar_motions`, from the origin on; the heading is not wrapped."""
     forward, left, turn = motions.T
-    path = dead_reckoning(np.zeros(3), np.column_stack([np.ones(len(motions)), forward, turn]))
+    controls = np.column_stack([np.ones(len(motions)), forward, turn])
+    path = dead_reckoning(np.zeros(3), controls)
     heading = path[:-1, 2]
     path[1:, 0] -= np.cumsum(left * np.sin(heading))
     path[1:, 1] += np.cumsum(left * np.cos(heading))

@@ -111,7 +111,7 @@ def _bias_map(of: Characterisation) -> Figure:
     assert of.bias is not None
     bias = of.bias
     grid = of.bias.grid
-    reach = 1.15 * max(float(np.nanmax(np.abs(bias.value) + bias.half)), 0.1)
+    reach = 1.15 * max(np.nanmax(np.abs(bias.value) + bias.half), 0.1)
 
     def draw() -> Drawing:
         figure, panels = canvas(1.9, 3, 3)
@@ -124,7 +124,7 @@ def _bias_map(of: Characterisation) -> Figure:
             axes.set(xlabel="u (px)", ylabel=f"bias of {name} (px)", ylim=(-reach, reach))
         return add_legend(figure)
 
-    middle = float(np.nanmedian(bias.half))
+    middle = np.nanmedian(bias.half)
     caption = (
         f"Bias of u, v and d at the nodes of the map (fig. 8), before any shrinkage; the median of the intervals is "
         f"±{middle:.2g} px. Nodes with too few data are left out."
@@ -173,11 +173,11 @@ def _correlation(of: Characterisation) -> tuple[Figure, ...]:
 
 def _draw_lags(of: Characterisation) -> Drawing:
     found = np.concatenate([np.abs(c.lags[np.isfinite(c.lags)]) for c in of.coordinates])
-    reach = 1.15 * max(float(found.max()), 0.1)
+    reach = 1.15 * max(found.max(), 0.1)
     figure, panels = canvas(1.5, 3, 3)
     for c, axes in zip(of.coordinates, panels, strict=True):
         lags = np.flatnonzero(np.isfinite(c.lags)) + 1
-        bound = float(np.nanmax(c.bounds))
+        bound = np.nanmax(c.bounds)
         axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
         axes.axhline(0.0, **stroke(EXPECTED))
         axes.vlines(lags, 0.0, c.lags[lags - 1], color=MEASURED.colour, linewidth=MEASURED.width)

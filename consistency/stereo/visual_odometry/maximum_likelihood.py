@@ -40,7 +40,7 @@ SLACK = 1e-12  # relative rounding of the cost
 
 def threshold(dof: int) -> float:
     """Standardised residual c, of ``dof`` dimensions, that a point without fault exceeds with probability 0.05."""
-    return float(np.sqrt(stats.chi2.isf(TAIL, dof)))
+    return np.sqrt(stats.chi2.isf(TAIL, dof))
 
 
 def loss(robust: Robust | None, s: Array, c: float) -> tuple[Array, Array, Array]:
@@ -263,7 +263,7 @@ def _cost(
     c: float,
 ) -> tuple[float, Array, Array]:
     rho, weight, bend = loss(robust, frames.squared(pose, q), c)
-    return 0.5 * float(rho.sum()), weight, bend
+    return 0.5 * rho.sum(), weight, bend
 
 
 def _step(
@@ -280,17 +280,16 @@ def _step(
         qq = qq * (1.0 + damping * np.eye(3))
     inverse, definite = arrays.symmetric_inverses(qq)
     gain = f.dq @ inverse
-    g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
-    reduced = dd - gain @ np.swapaxes(f.dq, 1, 2)
-    H = np.dot(weight[None], reduced.reshape(-1, 36)).reshape(6, 6)
+    g = f.d - np.einsum("nij,nj->ni", gain, f.q)
+    H = np.tensordot(weight, dd - gain @ np.swapaxes(f.dq, 1, 2), 1)
     H += 2.0 * (g.T * bend) @ g
     try:
         np.linalg.cholesky(H)
         step = -np.linalg.solve(H, weight @ g)
     except np.linalg.LinAlgError:
         return np.zeros(6), np.zeros(f.q.shape), np.nan
-    step_q = -(inverse @ (f.q + step @ f.dq)[:, :, None])[:, :, 0]
+    step_q = -np.einsum("nij,nj->ni", inverse, f.q + step @ f.dq)
     if not definite.all():
         return step, step_q, np.nan
     slope = step @ (weight @ f.d) + weight @ (step_q * f.q).sum(axis=1)
-    return step, step_q, -float(slope)
+    return step, step_q, -slope

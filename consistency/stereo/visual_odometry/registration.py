@@ -46,7 +46,7 @@ def register_svd(p1: Array, p2: Array) -> RelativePose:
     """
     p1, p2 = checked_clouds(p1, p2)
     R, t, fixed = rigid_motions(p1, p2)
-    _require_unique(float(fixed))
+    _require_unique(fixed)
     return RelativePose(R, t)
 
 
@@ -87,7 +87,7 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     B_i[:, 1:, 1:] = -np.tensordot(b, AXES, 1)  # -[b]x
     B = np.einsum("nij,nkj->ik", B_i, B_i)
     values, vectors = np.linalg.eigh(B)
-    _require_unique(float((values[1] - values[0]) / values[3]))
+    _require_unique((values[1] - values[0]) / values[3])
     scalar, *vector = vectors[:, 0]
     R = Rotation.from_quat([*vector, scalar]).as_matrix()
     return RelativePose(R, p1.mean(axis=0) - R @ p2.mean(axis=0))
@@ -218,7 +218,7 @@ def draws_for(share: float, most: int) -> float:
     """Draws of three until one is of inliers only with :data:`CONFIDENCE`, by their share; ``most`` at most."""
     clean = share**3  # probability that a draw has inliers only
     if clean == 0.0:
-        return float(most)
+        return most
     return min(most, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12)))
 
 
@@ -268,7 +268,7 @@ def _search(
     """Inliers (N,) of the best of adaptively many draws."""
     best = np.zeros(len(p1), bool)
     draws = 0
-    needed = float(MOST)
+    needed: float = MOST
     while draws < needed:
         triples = draw_triples(rng, ROUND, len(p1))
         R, t, fixed = rigid_motions(p1[triples], p2[triples])
@@ -277,5 +277,5 @@ def _search(
         if first.sum() > best.sum():
             best = first
         draws += ROUND
-        needed = draws_for(float(best.mean()), MOST)
+        needed = draws_for(best.mean(), MOST)
     return best

@@ -19,9 +19,7 @@ from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockEr
 
 LOCKED = 1e-6  # cosine of the pitch below which six digits of roll and yaw are left
 
-AXES = np.array(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
-)  # [e_k]x, the rotations' generators
+AXES = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2)  # [e_k]x, the rotations' generators
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,8 @@ def euler_angles(R: Array) -> Array:
         raise GimbalLockError("pose: a pitch of 90 degrees, roll and yaw are not defined; turn the frames' axes")
     roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
+    pitch = np.arctan2(-R[..., 2, 0], cosine)
+    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
@@ -102,18 +101,21 @@ def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
     R_rp = Y @ R_r
     R_ry = Z @ R_r
     R_py = Z @ R_p
-    second = [[R_r @ X, R_rp, R_ry], [R_rp, Y @ R_p, R_py], [R_ry, R_py, Z @ R_y]]
+    second = [
+        [R_r @ X, R_rp, R_ry],
+        [R_rp, Y @ R_p, R_py],
+        [R_ry, R_py, Z @ R_y],
+    ]
     return np.array([R_r, R_p, R_y]), np.array(second)
 
 
 def angular(pose: RelativePose) -> Array:
     """E (3, 3) with omega = E d rpy: the small rotation of frame 1 that a change of the angles is."""
     _, pitch, yaw = pose.rpy
-    cp = np.cos(pitch)
-    sp = np.sin(pitch)
-    cy = np.cos(yaw)
-    sy = np.sin(yaw)
-    return np.array([[cy * cp, -sy, 0.0], [sy * cp, cy, 0.0], [-sp, 0.0, 1.0]])
+    E = np.eye(3)
+    E[:, 0] = geometry.rotation(0.0, pitch, yaw)[:, 0]
+    E[:, 1] = geometry.rotation(0.0, 0.0, yaw)[:, 1]
+    return E
 
 
 def compose(
@@ -157,7 +159,7 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     J = np.zeros((6, 6))
     J[:3, :3] = -pose.R.T
     J[:3, 3:] = -pose.R.T @ cross_matrix(pose.t) @ angular(pose)
-    J[3:, 3:] = -np.linalg.inv(angular(inverse)) @ pose.R.T @ angular(pose)
+    J[3:, 3:] = -np.linalg.solve(angular(inverse), pose.R.T @ angular(pose))
     return inverse, propagated(J, S)
 
 

@@ -20,7 +20,7 @@ from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches
 ROUND = 32  # draws at once
 MOST = 1024  # draws at most; finds CONFIDENCE from a share of inliers of 19 % on
 SLACK_PX = 1.0  # of a coordinate in the search: poses of three noisy points miss all others by some pixels
-MEDIAN = float(stats.chi2.median(4))  # of an honest squared distance
+MEDIAN = stats.chi2.median(4)  # of an honest squared distance
 ROUNDS = 10  # of the gate to the noise that is there, at most
 FEWEST = 8  # inliers that tell how large the noise is
 
@@ -114,7 +114,7 @@ def inliers_within(squared: Array, gate: float, among: Array) -> Array:
     for _ in range(ROUNDS):
         scale = 1.0
         if inliers.sum() >= FEWEST:
-            scale = max(1.0, float(np.median(squared[inliers])) / MEDIAN)
+            scale = max(1.0, np.median(squared[inliers]) / MEDIAN)
         found = squared <= scale * gate**2
         if (found == inliers).all():
             break
@@ -135,7 +135,7 @@ def _search(
     best = None
     inliers = np.zeros(len(p0), bool)
     draws = 0
-    needed = float(MOST)
+    needed: float = MOST
     while draws < needed:
         R, t = _poses_of(rig, p0, uv1, draw_triples(rng, ROUND, len(p0)))
         draws += ROUND
@@ -150,7 +150,7 @@ def _search(
             least = cost[k]
             best = RelativePose(R[k], t[k])
             inliers = squared[k] <= gate**2
-            needed = draws_for(float(inliers.mean()), MOST)
+            needed = draws_for(inliers.mean(), MOST)
     return best, inliers
 
 

@@ -62,21 +62,21 @@ def cost_derivatives(
     Without ``exact`` they are Gauss-Newton's, which leave out second derivatives of the measurement. With a = R q + t
     and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
     """
-    R, (R_k, R_kl) = pose.R, rotation_derivatives(pose)
+    R = pose.R
+    R_k, R_kl = rotation_derivatives(pose)
     f_a, f_aa, f_az, f_z1 = _frame(frames.measure, frames.z1, frames.W1, pose.apply(q), exact)
     f_b, f_bb, f_bz, f_z2 = _frame(frames.measure, frames.z2, frames.W2, q, exact)
     At = np.zeros((len(q), 6, 3))
     At[:, :3] = np.eye(3)
-    At[:, 3:] = np.swapaxes(R_k @ q.T, 0, 2).swapaxes(1, 2)
+    At[:, 3:] = np.einsum("kij,nj->nki", R_k, q)
     AtH = At @ f_aa
     dd = AtH @ np.swapaxes(At, 1, 2)
     dq = AtH @ R
     if exact:
-        outer = (f_a[:, :, None] * q[:, None]).reshape(-1, 9)
-        dd[:, 3:, 3:] += (outer @ R_kl.reshape(9, 9).T).reshape(-1, 3, 3)
-        dq[:, 3:] += np.swapaxes(np.swapaxes(R_k, 1, 2) @ f_a.T, 0, 2).swapaxes(1, 2)
+        dd[:, 3:, 3:] += np.tensordot(f_a[:, :, None] * q[:, None], R_kl, ((1, 2), (2, 3)))
+        dq[:, 3:] += np.einsum("kij,ni->nkj", R_k, f_a)
     return Derivatives(
-        d=(At @ f_a[:, :, None])[:, :, 0],
+        d=np.einsum("nij,nj->ni", At, f_a),
         q=f_a @ R + f_b,
         z1=f_z1,
         z2=f_z2,
@@ -98,12 +98,13 @@ def _frame(
 ) -> tuple[Array, Array, Array, Array]:
     """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
     J = measure.jacobian(p)
-    We = (W @ (z - measure.value(p))[:, :, None])[:, :, 0]
     JtW = np.swapaxes(J, 1, 2) @ W
+    We = np.einsum("nij,nj->ni", W, z - measure.value(p))
+    f_p = -np.einsum("nij,ni->nj", J, We)
     f_pp = JtW @ J
     if exact:
         f_pp = f_pp - measure.second(p, J, We)
-    return -(We[:, None] @ J)[:, 0], f_pp, -JtW, We
+    return f_p, f_pp, -JtW, We
 
 
 class PointMatches:
@@ -144,17 +145,12 @@ class PixelMatches:
 
     def jacobian(self, p: Array) -> Array:
         """Derivative of :meth:`value` by the point, (N, 4, 3), px/m."""
-        w_p = self.last[:, :3]
-        return (self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None]
+        from_depth = self.value(p)[:, :, None] * self.last[:, :3]
+        return (self.top[:, :3] - from_depth) / self._depth(p)[:, :, None]
 
-    def second(
-        self,
-        p: Array,
-        J: Array,
-        w: Array,
-    ) -> Array:
+    def second(self, p: Array, J: Array, w: Array) -> Array:
         """Second derivatives of the four pixels, weighted with w (N, 4) and summed, (N, 3, 3); J is (N, 4, 3)."""
-        half = np.swapaxes(J * (w / self._depth(p))[:, :, None], 1, 2) @ self.last[:, :3]
+        half = np.einsum("nij,ni,ik->njk", J, w / self._depth(p), self.last[:, :3])
         return -(half + np.swapaxes(half, 1, 2))
 
     def _depth(self, p: Array) -> Array:

@@ -31,6 +31,7 @@ from consistency.stereo.rendered_images.stages import (
     TrackResidual,
     dissimilarity,
     patches,
+    square,
 )
 
 # flags of an observation
@@ -195,7 +196,8 @@ class Chain:
         camera: StereoCamera,
         pose: Array,
     ) -> None:
-        points, layer = scene.seen(pose, camera.left.field[::8, ::8].reshape(-1, 3))
+        rays = camera.left.field[::8, ::8].reshape(-1, 3)
+        points, layer = scene.seen(pose, rays)
         d = camera.ideal(to_camera(pose, points[layer >= 0]))[:, 2]
         low, high = self.correspondence.search
         if not ((d >= low) & (d <= high)).any():
@@ -315,8 +317,7 @@ def at_junction(
     uv: Array,
 ) -> Array:
     """Whether the window of a feature (N, 2) px shows two depths, so that it is on the edge of a layer, (N,) bool."""
-    reach = np.linspace(-WINDOW / 2.0, WINDOW / 2.0, 7)
-    grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    grid = square(np.linspace(-WINDOW / 2.0, WINDOW / 2.0, 7))
     rays = camera.left.rays(uv[:, None] + grid)
     points, layer = scene.seen(pose, rays.reshape(-1, 3))
     depth = to_camera(pose, points)[:, 0]

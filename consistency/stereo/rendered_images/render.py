@@ -55,7 +55,8 @@ def render(
         where = _box(layer, origin, rays, camera.f)
         if where is not None:
             part = image[where]
-            part[...] = _painted(part.ravel(), layer, origin, rays[where].reshape(-1, 3), camera.f).reshape(part.shape)
+            painted = _painted(part.ravel(), layer, origin, rays[where].reshape(-1, 3), camera.f)
+            image[where] = painted.reshape(part.shape)
     return image
 
 
@@ -68,7 +69,8 @@ def _near(
 ) -> Array:
     """Which of the places on a plane are on the layer or within ``margin`` m of it, and before the camera."""
     with np.errstate(invalid="ignore"):
-        inside = (np.abs(a) < layer.half[0] + margin) & (np.abs(b) < layer.half[1] + margin)
+        inside = np.abs(a) < layer.half[0] + margin
+        inside &= np.abs(b) < layer.half[1] + margin
         return inside & (reach > 0.0) & np.isfinite(reach)
 
 
@@ -81,7 +83,8 @@ def _box(
     """Rows and columns of an image whose rays (h, w, 3) may meet the layer, from every COARSE-th of them."""
     coarse = rays[::COARSE, ::COARSE]
     reach, a, b = layer.meet(origin, coarse.reshape(-1, 3))
-    near = _near(layer, reach, a, b, (2.0 * COARSE + REACH * BLUR) / f * reach).reshape(coarse.shape[:2])
+    margin = (2.0 * COARSE + REACH * BLUR) / f * reach
+    near = _near(layer, reach, a, b, margin).reshape(coarse.shape[:2])
     if not near.any():
         return None
     return _extent(near.any(axis=1)), _extent(near.any(axis=0))
@@ -135,7 +138,8 @@ def render_pair(scene: Scene, camera: StereoCamera, pose: Array) -> tuple[Array,
 def digitised(image: Array, noise: float, rng: np.random.Generator) -> Array:
     """Image (h, w) with Gaussian grey noise of sd ``noise``, as 8-bit."""
     drawn = rng.standard_normal(image.shape, np.float32)
-    return np.asarray(np.clip(np.rint(image + np.float32(noise) * drawn), 0, 255), np.uint8)
+    noisy = np.rint(image + np.float32(noise) * drawn)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
 
 
 def film(

@@ -76,7 +76,8 @@ class RandomTexture:
         ring = (radius > 0.5 / SAMPLES) & (radius <= 1.0 / SAMPLES)
         tiles = []
         for _ in range(octaves):
-            tile = np.fft.ifft2(np.fft.fft2(rng.standard_normal((TILE, TILE))) * ring).real
+            noise = rng.standard_normal((TILE, TILE))
+            tile = np.fft.ifft2(np.fft.fft2(noise) * ring).real
             tiles.append((tile / tile.std()).astype(np.float32))
         return cls(tuple(tiles), tuple(finest * 2.0**k for k in range(octaves)), contrast)
 
@@ -91,7 +92,8 @@ class RandomTexture:
             kept = np.exp(-2.0 * (np.pi * np.asarray(blur) * 0.75 / shortest) ** 2)  # 0.75: middle of the octave
             if np.max(kept) > FAINT:
                 scale = SAMPLES / shortest
-                total += np.float32(self.contrast) * kept.astype(np.float32) * sampled(tile, scale * b, scale * a)
+                contrast = np.float32(self.contrast) * kept.astype(np.float32)
+                total += contrast * sampled(tile, scale * b, scale * a)
         return total
 
 
@@ -137,7 +139,8 @@ class Blobs:
         j = np.floor(b / self.cell).astype(int)
         off = np.stack([a, b], axis=-1) - self.centres(i, j)
         variance = self.radius**2 + np.square(blur)
-        spot = self.radius**2 / variance * np.exp(-0.5 * np.square(off).sum(axis=-1) / variance)
+        squared = np.square(off).sum(axis=-1)
+        spot = self.radius**2 / variance * np.exp(-0.5 * squared / variance)
         return np.asarray(self.ground - self.depth * spot, np.float32)
 
 
@@ -212,7 +215,9 @@ class Layer:
         """
         right = np.array([np.sin(slant), -np.cos(slant), 0.0])
         middle = np.array([distance, *centre])
-        return cls(middle, right, np.array([0.0, 0.0, -1.0]), (0.5 * size[0], 0.5 * size[1]), texture)
+        down = np.array([0.0, 0.0, -1.0])
+        width, height = size
+        return cls(middle, right, down, (0.5 * width, 0.5 * height), texture)
 
     def meet(self, origin: Array, rays: Array) -> tuple[Array, Array, Array]:
         """Where rays (N, 3) from ``origin`` (3,) meet the plane.
@@ -265,7 +270,8 @@ class Scene:
         number = np.full(len(rays), NOWHERE)
         for k, layer in enumerate(self.layers):
             reach, a, b = layer.meet(pose[:3], turned)
-            hit = (reach > 0.0) & np.isfinite(reach) & (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
+            hit = (reach > 0.0) & np.isfinite(reach)
+            hit &= (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
             points[hit] = layer.points(a[hit], b[hit])
             number[hit] = k
         return points, number

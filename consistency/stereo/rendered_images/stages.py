@@ -46,7 +46,8 @@ class GoodFeatures:
     def choose(self, image: Array) -> Array:
         require_size(image, 2 * int(MARGIN) + BLOCK, "the margin of the selection")
         mask = np.zeros(image.shape, np.uint8)
-        mask[int(MARGIN) : -int(MARGIN), int(MARGIN) : -int(MARGIN)] = 1
+        inner = slice(int(MARGIN), -int(MARGIN))
+        mask[inner, inner] = 1
         found = opencv().goodFeaturesToTrack(image, self.count, self.quality, self.distance, mask=mask, blockSize=BLOCK)
         if found is None:
             return np.empty((0, 2))
@@ -328,8 +329,8 @@ class LeftRightCheck:
         left = np.ascontiguousarray(evidence.right[:, ::-1])
         right = np.ascontiguousarray(evidence.left[:, ::-1])
         own = np.where(np.isfinite(evidence.d), evidence.d, 0.0)
-        there = np.stack([own - evidence.uv[:, 0], evidence.uv[:, 1]], axis=-1)
-        back = evidence.correspondence.measure(left, right, there)
+        u, v = evidence.uv.T
+        back = evidence.correspondence.measure(left, right, np.column_stack([own - u, v]))
         return np.abs(back - evidence.d) <= self.tolerance
 
 
@@ -348,12 +349,19 @@ def patches(image: Array, uv: Array, zoom: Array) -> Array:
 
     A patch of ``zoom`` (N,) covers that many times ``PATCH`` px of the image.
     """
-    reach = np.arange(PATCH) - (PATCH - 1) / 2.0
-    grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    grid = square(np.arange(PATCH) - (PATCH - 1) / 2.0)
     places = to_columns(image, uv)[:, None] + zoom[:, None, None] * grid
-    values = map_coordinates(image.astype(np.float32), places[..., ::-1].transpose(2, 0, 1), order=1, mode="nearest")
-    values = values - values.mean(axis=1, keepdims=True)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
+    rows_first = places[..., ::-1].transpose(2, 0, 1)
+    values = map_coordinates(image.astype(np.float32), rows_first, order=1, mode="nearest")
+    values -= values.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    return values / np.maximum(length, 1e-9)
+
+
+def square(reach: Array) -> Array:
+    """Places (n * n, 2) of a square, ``reach`` (n,) along each side, row by row."""
+    across, down = np.meshgrid(reach, reach)
+    return np.column_stack([across.ravel(), down.ravel()])
 
 
 def dissimilarity(first: Array, now: Array) -> Array:

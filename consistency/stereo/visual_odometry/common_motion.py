@@ -68,14 +68,22 @@ def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
     if len(every):
         scale = MAD * np.median(every, axis=0)
     offered = sum(len(trial.z) for trial in trials)
-    return Screened(_begun_anew(trials, broken), scale, offered, len(every), sum(map(len, broken)))
+    return Screened(
+        _begun_anew(trials, broken),
+        scale,
+        offered=offered,
+        judged=len(every),
+        broken=sum(map(len, broken)),
+    )
 
 
 def _pairs(trial: Trial) -> tuple[Indices, Indices]:
     """Rows (n,) of observations, and of those of the same landmark in the step after; sorted by step."""
     step = trial.step - 1
     order = np.lexsort((step, trial.landmark))
-    follows = (np.diff(trial.landmark[order]) == 0) & (np.diff(step[order]) == 1)
+    same_landmark = np.diff(trial.landmark[order]) == 0
+    next_step = np.diff(step[order]) == 1
+    follows = same_landmark & next_step
     before = order[:-1][follows]
     after = order[1:][follows]
     by_step = np.argsort(step[after], kind="stable")
@@ -99,7 +107,8 @@ def _misfits(
         dt, v, omega = trial.controls[k]
         mean = np.array([dt * v, 0.0, 0.0, 0.0, 0.0, dt * omega])
         noise = dt * np.repeat([belief.motion.sigma_v, belief.motion.sigma_omega], 3)
-        out[rows] = _misfit(points[rows], seen[rows], mean, np.hypot(noise, LOOSE), gate / GATE, belief.sensor)
+        sigma = np.hypot(noise, LOOSE)
+        out[rows] = _misfit(points[rows], seen[rows], mean, sigma, gate / GATE, belief.sensor)
     return out
 
 
@@ -119,7 +128,8 @@ def _misfit(
     move = mean.copy()
     for _ in range(STEPS):
         error, slope = _error_and_slope(points, seen, move, sensor)
-        weight = 1.0 / (1.0 + ((error / (SOFT * scale)) ** 2).sum(axis=1))
+        squared = ((error / (SOFT * scale)) ** 2).sum(axis=1)
+        weight = 1.0 / (1.0 + squared)
         J = slope / scale[:, None]
         normal = np.einsum("n,nij,nik->jk", weight, J, J) + np.diag(sigma**-2)
         right = np.einsum("n,nij,ni->j", weight, J, error / scale) + (mean - move) / sigma**2
@@ -140,7 +150,7 @@ def _error_and_slope(
     turn = Rotation.from_rotvec(move[3:]).as_matrix()
     moved = (points - move[:3]) @ turn
     expected, by_point = _expected(moved, sensor)
-    by_turn = np.cross(moved[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)
+    by_turn = np.cross(moved[:, None, :], np.eye(3)).transpose(0, 2, 1)
     by_move = np.concatenate([np.broadcast_to(-turn.T, by_turn.shape), by_turn], axis=2)
     error = seen - expected
     if sensor.model == "range-bearing":

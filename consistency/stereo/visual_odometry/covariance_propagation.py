@@ -89,7 +89,8 @@ def triangulation_derivatives(
     last = rig.cameras[:, 2].repeat(2, axis=0)  # (4, 4), P_3 of each row
     residual = np.einsum("nij,nj->ni", A, points) - b
     depth = points @ last[:, :3].T + last[:, 3]
-    C_pu = np.swapaxes(A * depth[:, :, None] + last[:, :3] * residual[:, :, None], 1, 2)
+    C_up = A * depth[:, :, None] + last[:, :3] * residual[:, :, None]
+    C_pu = np.swapaxes(C_up, 1, 2)
     return np.swapaxes(A, 1, 2) @ A, C_pu
 
 

@@ -146,7 +146,8 @@ def epipolar_gate(
     is a difference of rows, and the right column must not exceed the left one by more than ``tolerance``.
     """
     lines = homogeneous(left) @ fundamental(rig).T  # (N, 3) in the right image
-    lines = lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    length = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    lines = lines / np.maximum(length, 1e-12)
     distance = lines.astype(np.float32) @ homogeneous(right).T.astype(np.float32)
     near = np.abs(distance, out=distance) <= tolerance
     if is_rectified(rig):

@@ -179,14 +179,17 @@ def neighbours(good: Array, t: Array, k: int) -> tuple[Indices, Array]:
     if len(around) == 1:
         return around, np.ones(1)
     middle = 0.5 * (t[1:] + t[:-1])
-    share = (middle[k] - middle[around[0]]) / (middle[around[1]] - middle[around[0]])
+    before, after = middle[around]
+    share = (middle[k] - before) / (after - before)
     return around, np.array([1.0 - share, share])
 
 
 def _missed(speed: Array, offsets: Indices, share: Array) -> Array:
     """By how much a measured velocity differs from that of the motions at ``offsets`` from it, (n, 6)."""
     T = len(speed)
-    at = np.arange(max(0, -offsets.min()), min(T, T - offsets.max()))
+    first = max(0, -offsets.min())
+    last = min(T, T - offsets.max())
+    at = np.arange(first, last)
     expected = np.zeros((len(at), 6))
     for part, offset in zip(share, offsets, strict=True):
         expected += part * speed[at + offset]

@@ -133,13 +133,16 @@ def rigid_motions(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     """
     c1 = p1.mean(axis=-2)
     c2 = p2.mean(axis=-2)
-    M = np.swapaxes(p1 - c1[..., None, :], -1, -2) @ (p2 - c2[..., None, :])
+    centred1 = p1 - c1[..., None, :]
+    centred2 = p2 - c2[..., None, :]
+    M = np.swapaxes(centred1, -1, -2) @ centred2
     U, s, Vt = np.linalg.svd(M)
     sign = np.where(np.linalg.det(U @ Vt) < 0.0, -1.0, 1.0)
     U[..., 2] *= sign[..., None]
     R = U @ Vt
     t = c1 - (R @ c2[..., None])[..., 0]
-    fixed = (s[..., 1] + sign * s[..., 2]) / np.maximum(s[..., 0], np.finfo(float).tiny)
+    largest, second, third = np.moveaxis(s, -1, 0)
+    fixed = (second + sign * third) / np.maximum(largest, np.finfo(float).tiny)
     return R, t, fixed
 
 

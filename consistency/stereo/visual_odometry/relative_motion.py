@@ -335,7 +335,8 @@ def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
     The disparity itself counts as well: off the epipolar line least squares makes a near point of a small disparity.
     """
     good = triangulable(rig, uv)
-    good[good] = triangulate(rig, uv[good])[:, 2] <= rig.K_left[0, 0] * rig.baseline / min_disparity
+    furthest = rig.K_left[0, 0] * rig.baseline / min_disparity
+    good[good] = triangulate(rig, uv[good])[:, 2] <= furthest
     good[good] = disparities(rig, uv[good]) >= min_disparity * (1.0 - ROUNDING)
     return good
 
@@ -349,6 +350,6 @@ def disparities(rig: StereoRig, uv: Array) -> Array:
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
     turn = np.stack([x, y, np.cross(x, y)])
-    left = homogeneous(uv[:, :2]) @ np.linalg.inv(rig.K_left).T @ turn.T
-    right = homogeneous(uv[:, 2:]) @ np.linalg.inv(rig.K_right).T @ rig.R.T @ turn.T
-    return rig.K_left[0, 0] * (left[:, 0] / left[:, 2] - right[:, 0] / right[:, 2])
+    x_left, _, z_left = turn @ np.linalg.inv(rig.K_left) @ homogeneous(uv[:, :2]).T
+    x_right, _, z_right = turn @ rig.R @ np.linalg.inv(rig.K_right) @ homogeneous(uv[:, 2:]).T
+    return rig.K_left[0, 0] * (x_left / z_left - x_right / z_right)

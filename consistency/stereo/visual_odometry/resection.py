@@ -59,7 +59,8 @@ def resect_ransac(
         No motion has enough inliers: 4, and a tenth of the matches.
     """
     least = fewest(len(uv0))
-    found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
+    variance = sigma0**2 + sigma1**2 + SLACK_PX**2
+    found, inliers = _search(rig, triangulate(rig, uv0), uv1, variance, gate, rng)
     if found is not None:
         inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, found), gate, inliers)
     if found is None or inliers.sum() < least:

@@ -61,7 +61,9 @@ class Sequence:
             An image cannot be read or has another size than the first one.
         """
         size = self.rectification.rig.image_size
-        return self.rectification.apply(read_image(self.left[frame], size), read_image(self.right[frame], size))
+        left = read_image(self.left[frame], size)
+        right = read_image(self.right[frame], size)
+        return self.rectification.apply(left, right)
 
     def __iter__(self) -> Iterator[tuple[Array, Array]]:
         return (self.pair(frame) for frame in range(len(self)))
@@ -273,7 +275,9 @@ def read_number_table(path: Path, delimiter: str | None, refusal: str) -> Array:
     text = read_text(path, refusal)
     with reading(path, refusal):
         lines = [line for line in text.splitlines() if line.split("#", 1)[0].strip()]
-        values = np.loadtxt(lines, delimiter=delimiter, ndmin=2) if lines else np.empty((0, 0))
+        values = np.empty((0, 0))
+        if lines:
+            values = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
         if not (np.abs(values) < HUGE).all():
             raise ValueError("a number that is not finite")
     return values
@@ -286,7 +290,8 @@ def _euroc(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
         root = folder / "mav0"
     left = _camera(root / "cam0")
     right = _camera(root / "cam1")
-    return _by_name(root, list(left.values()), list(right.values())), np.array(list(left)) / 1e9
+    files = _by_name(root, list(left.values()), list(right.values()))
+    return files, np.array(list(left)) / 1e9
 
 
 def _camera(folder: Path) -> dict[int, Path]:

@@ -74,7 +74,8 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
     order = np.lexsort((rows["piece"], -rows["z2"], -np.minimum(left, rule.max_age), rows["step"]))
     landmark = np.full(len(rows), FREE)
     count = 0
-    for at in np.split(order, np.flatnonzero(np.diff(rows["step"].to_numpy()[order])) + 1):
+    starts = 1 + np.flatnonzero(np.diff(rows["step"].to_numpy()[order]))
+    for at in np.split(order, starts):
         taken = landmark[at] != FREE
         crowd = np.bincount(band[at[taken]], minlength=rule.bands)
         candidates = at[~taken & (left[at] >= rule.min_life)]

@@ -107,9 +107,11 @@ def symmetric_inverses(C: Array) -> tuple[Array, Array]:
     if C.shape[-1] != 3:
         one = np.eye(C.shape[-1])
         finite = np.isfinite(C).all(axis=(-2, -1))
-        definite = finite & (np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0] > 0.0)
+        least = np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0]
+        definite = finite & (least > 0.0)
         return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
     cofactors = np.cross(np.roll(C, -1, axis=-2), np.roll(C, -2, axis=-2))
     det = (C[..., 0, :] * cofactors[..., 0, :]).sum(axis=-1)
-    definite = (C[..., 0, 0] > 0.0) & (cofactors[..., 2, 2] > 0.0) & (det > 0.0)
+    definite = det > 0.0
+    definite &= (C[..., 0, 0] > 0.0) & (cofactors[..., 2, 2] > 0.0)
     return cofactors / np.where(definite, det, 1.0)[..., None, None], definite

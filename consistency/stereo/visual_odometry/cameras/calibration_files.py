@@ -185,7 +185,9 @@ def _euroc_camera(folder: Path, camera: str) -> _Camera:
 
 
 def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Array:
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = np.diag([fx, fy, 1.0])
+    K[:2, 2] = cx, cy
+    return K
 
 
 def read_boofcv(path: Path) -> PairCalibration:
@@ -195,7 +197,7 @@ def read_boofcv(path: Path) -> PairCalibration:
     K_right, D_right, other = _boofcv_camera(keys, "right")
     pose = keys.table("rightToLeft")
     R = pose.numbers("rotation", 9).reshape(3, 3)
-    t = np.array([pose.number("x"), pose.number("y"), pose.number("z")])
+    t = np.array(list(map(pose.number, "xyz")))
     if size != other:
         raise InputError(f"{path}: left has {in_px(size)}, right {other[0]} x {other[1]}; must be equal")
     return PairCalibration(str(path), K_left, K_right, D_left, D_right, R.T, -R.T @ t, size)
@@ -265,7 +267,18 @@ def _projections(
         pose = _pose(rectified, t_left)
         body = CAMERA_0
     none = np.zeros(4)
-    return PairCalibration(str(path), K_left, K_right, none, none, np.eye(3), t_right - t_left, size, pose, body)
+    return PairCalibration(
+        str(path),
+        K_left,
+        K_right,
+        D_left=none,
+        D_right=none,
+        R=np.eye(3),
+        T=t_right - t_left,
+        image_size=size,
+        body_from_left=pose,
+        body=body,
+    )
 
 
 def _projection(path: Path, rows: dict[str, Array], name: str) -> tuple[Array, Array]:

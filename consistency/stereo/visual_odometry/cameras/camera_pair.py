@@ -83,7 +83,9 @@ class Rectification:
             return left, right
         cv2 = opencv()
         left_maps, right_maps = self.maps
-        return cv2.remap(left, *left_maps, cv2.INTER_LINEAR), cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
+        left = cv2.remap(left, *left_maps, cv2.INTER_LINEAR)
+        right = cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
+        return left, right
 
 
 def rectify(calibration: PairCalibration, image_size: tuple[int, int]) -> Rectification:

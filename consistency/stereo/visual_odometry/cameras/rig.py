@@ -66,7 +66,8 @@ class StereoRig:
     def cameras(self) -> Array:
         """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""
         left = np.column_stack([self.K_left, np.zeros(3)])
-        return np.stack([left, self.K_right @ np.column_stack([self.R.T, -self.R.T @ self.t])])
+        right = np.column_stack([self.R.T, -self.R.T @ self.t])
+        return np.stack([left, self.K_right @ right])
 
     def project(self, points: Array) -> Array:
         """Eq. 2.1 and 2.2: points in the left camera's frame to both images.
@@ -87,14 +88,17 @@ class StereoRig:
         p = arrays.checked_rows("points", points, 3)
         h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
         depth = h[:, :, 2]
-        if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
-            k = int(np.argmax(bad))
+        bad = np.flatnonzero((depth <= NEAREST * self.baseline).any(axis=0))
+        if len(bad):
+            k = int(bad[0])
             raise PointError(f"points: number {k} is at or behind a camera; leave such points out", k)
-        return np.concatenate(list(h[:, :, :2] / depth[:, :, None]), axis=1)
+        left, right = h[:, :, :2] / depth[:, :, None]
+        return np.column_stack([left, right])
 
     def inside(self, uv: Array) -> Array:
         """(N, 4) px to (N,) bool: seen in both images."""
-        return ((uv >= 0.0) & (uv <= np.tile(self.image_size, 2) - 1.0)).all(axis=1)
+        largest = np.tile(self.image_size, 2) - 1.0
+        return ((uv >= 0.0) & (uv <= largest)).all(axis=1)
 
 
 def triangulate(rig: StereoRig, uv: Array) -> Array:

@@ -6,7 +6,10 @@ Only the stages and the chain need OpenCV, the extra ``vision``.
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.stereo.rendered_images.calibration import (
+    from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
+    from consistency.stereo.rendered_images.chain import Chain, Tracks
+    from consistency.stereo.rendered_images.stops import Stops, stand
+    from consistency.stereo.rendered_images.track_errors import (
         Biases,
         Growth,
         TrackMeans,
@@ -14,9 +17,6 @@ with explained_import(__name__):
         disparity_growth,
         track_means,
     )
-    from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-    from consistency.stereo.rendered_images.chain import Chain, Tracks
-    from consistency.stereo.rendered_images.stops import Stops, stand
 
 __all__ = [
     "Biases",

@@ -16,11 +16,11 @@ from consistency.bench.runs.findings import script, sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.rendered_images.calibration import track_means
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
 from consistency.stereo.rendered_images.stages import LeftRightCheck
 from consistency.stereo.rendered_images.stops import Stops, stand
+from consistency.stereo.rendered_images.track_errors import track_means
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")

@@ -12,7 +12,7 @@ from consistency.bench.scenario.effects.node_tables import bilinear
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.likelihood import LikelihoodFit
-from consistency.stereo.characterising.log_residuals import FEW, Residuals
+from consistency.stereo.characterising.truth_residuals import FEW, Residuals
 
 GRID = (5, 4)  # nodes across and down
 TRACKS = 3  # that a node needs

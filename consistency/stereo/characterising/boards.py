@@ -16,7 +16,7 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.log_residuals import Residuals, robust_sd
+from consistency.stereo.characterising.truth_residuals import Residuals, robust_sd
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.sequence import SUFFIXES, read_image
 
@@ -50,7 +50,7 @@ class Corners:
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class BoardCalibration:
     """Corners of one calibration in rectified pixels."""
 
     model: str
@@ -140,7 +140,7 @@ def _corners(cv2: Any, image: Array, board: Size) -> Array | None:
     return np.asarray(corners, float).reshape(-1, 2)
 
 
-def calibrate(corners: Corners, model: str) -> Calibrated:
+def calibrate(corners: Corners, model: str) -> BoardCalibration:
     """Calibrate with a distortion model and bring the corners to rectified pixels.
 
     Each camera is calibrated by itself, then both together with these held (OpenCV's ``stereoCalibrate``).
@@ -162,7 +162,7 @@ def calibrate(corners: Corners, model: str) -> Calibrated:
     left = _rectified(cv2, corners.left, K1, D1, R1, P1)
     right = _rectified(cv2, corners.right, K2, D2, R2, P2)
     centre = P1[:2, 2]
-    return Calibrated(
+    return BoardCalibration(
         model,
         z=np.concatenate([left - centre, (left - right)[..., :1]], axis=-1),
         rows=left[..., 1] - right[..., 1],
@@ -265,7 +265,7 @@ def _line(model: str, of: Characterisation) -> str:
     )
 
 
-def residuals_about_boards(calibrated: Calibrated, board: Array) -> Residuals:
+def residuals_about_boards(calibrated: BoardCalibration, board: Array) -> Residuals:
     """Residuals of corners about a board whose pose is fitted in each pair.
 
     The six parameters of each pose, and those of the calibration, are paid for: residuals are as large as they would
@@ -289,14 +289,14 @@ def residuals_about_boards(calibrated: Calibrated, board: Array) -> Residuals:
     return Residuals(r.reshape(-1, 3), ideal.reshape(-1, 3), track, step, moving)
 
 
-def _project(pose: Array, board: Array, calibrated: Calibrated) -> Array:
+def _project(pose: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """Ideal (u, v, d) (c, 3) of a board; the pose is a rotation vector and a place in m, sensor axes."""
     points = Rotation.from_rotvec(pose[:3]).apply(board) + pose[3:]
     x, y, w = points.T
     return np.stack(stereo.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
 
 
-def _first_pose(z: Array, board: Array, calibrated: Calibrated) -> Array:
+def _first_pose(z: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """The pose that lays the board best on the triangulated corners, Arun et al. (1987)."""
     u, v, d = z.T
     seen = np.stack(stereo.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
@@ -309,7 +309,7 @@ def _first_pose(z: Array, board: Array, calibrated: Calibrated) -> Array:
 def _fitted(
     z: Array,
     board: Array,
-    calibrated: Calibrated,
+    calibrated: BoardCalibration,
     start: Array,
     sigma: Array,
 ) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias_map import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.log_residuals import Residuals, octaves, select
+from consistency.stereo.characterising.truth_residuals import Residuals, octaves, select
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # probability that any interval misses

@@ -18,9 +18,9 @@ from consistency.referee.geometry import rotation
 from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.log_residuals import moved_before, residuals_of
-from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
+from consistency.stereo.characterising.fitted_tracks import characterise_posed
+from consistency.stereo.characterising.point_fit import SHORTEST, Sightings
+from consistency.stereo.characterising.truth_residuals import moved_before, residuals_of
 from consistency.stereo.frontend.planar_log import CAMERA
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
@@ -55,7 +55,7 @@ class SourceOptions:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredSensor:
     """A characterisation and what of the source's file stays as it was."""
 
     of: Characterisation
@@ -72,7 +72,7 @@ def characterise_log(
     grid: tuple[int, int],
     at_rest: bool = False,
     free_poses: bool = False,
-) -> Measured:
+) -> MeasuredSensor:
     """The sensor of a log folder.
 
     With true poses and landmarks everything is estimated; with true poses alone no bias map and no offsets; without
@@ -91,7 +91,7 @@ def characterise_log(
     sensor = PicturedSensor.model_validate(file.model_dump(include=set(PicturedSensor.model_fields)))
     dumped = file.model_dump(exclude_none=True)
     others: dict[str, Any] = {key: value for key, value in dumped.items() if key in OTHERS}
-    return Measured(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
+    return MeasuredSensor(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
 
 
 def _of_log(
@@ -129,7 +129,7 @@ def _of_log(
     return characterise_posed(seen, sensor, source, (REST,))
 
 
-def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None = None) -> Seen:
+def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None = None) -> Sightings:
     """What is seen from true poses, or with ``rests`` (T,) of numbers of rests, in each of these from one pose.
 
     A landmark is a track of its own in each run, and in each rest; steps between rests have the number -1.
@@ -152,10 +152,10 @@ def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None
         moving = moved_before(pose)
         parts.append((trial.z[order], R[step], t[step], tracks + track[order], step, moving[step]))
         tracks += trial.n_landmarks * (int(rest.max()) + 1)
-    return Seen(*map(np.concatenate, zip(*parts, strict=True)))
+    return Sightings(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _in_space(trial: Trial, path: Path) -> Seen:
+def _in_space(trial: Trial, path: Path) -> Sightings:
     """What is seen from the true poses of the left camera in a file of TUM's form, a line for each of steps 0..T."""
     lines = read_trajectory(path, true=True)
     if len(lines.values) != trial.steps + 1:
@@ -165,7 +165,7 @@ def _in_space(trial: Trial, path: Path) -> Seen:
     order = np.lexsort((trial.step, trial.landmark))
     step = trial.step[order]
     moving = np.ones(len(step), bool)
-    return Seen(trial.z[order], R[step], t[step], trial.landmark[order], step, moving)
+    return Sightings(trial.z[order], R[step], t[step], trial.landmark[order], step, moving)
 
 
 def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:

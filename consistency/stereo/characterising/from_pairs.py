@@ -10,11 +10,11 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
+from consistency.stereo.characterising.fitted_tracks import characterise_posed
 from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
-from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.log_residuals import robust_sd
-from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
-from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
+from consistency.stereo.characterising.point_fit import SHORTEST, Sightings
+from consistency.stereo.characterising.truth_residuals import robust_sd
+from consistency.stereo.frontend.camera_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.odometry import visual_odometry
@@ -86,13 +86,13 @@ def _seen(
     motions: list[RelativeMotion],
     R: Array,
     t: Array,
-) -> Seen:
+) -> Sightings:
     rows = observations(rig, motions)
     rows = rows[rows["z2"] > 0]
     step = rows["step"].to_numpy(np.int64)
     track = rows["piece"].to_numpy(np.int64)
     moving = np.full(len(step), np.ptp(t, axis=0).any())
-    return Seen(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
+    return Sightings(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
 
 
 def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:

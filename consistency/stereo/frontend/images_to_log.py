@@ -20,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
-from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
+from consistency.stereo.frontend.camera_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plane_of, stacked
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry

@@ -18,7 +18,7 @@ from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, s
 from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.coordinate_fit import Levels, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import Likelihood, Parameters, Rows, fit, regress
-from consistency.stereo.characterising.log_residuals import Residuals, octaves, residuals_of, select
+from consistency.stereo.characterising.truth_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))

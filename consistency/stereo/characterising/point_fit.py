@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import stereo
 from consistency.referee.types import Array, Indices
-from consistency.stereo.characterising.log_residuals import GROSS, MAD, Residuals
+from consistency.stereo.characterising.truth_residuals import GROSS, MAD, Residuals
 
 SHORTEST = 3  # observations of a track: with two, most of what is seen is used up by the point
 ROUNDS = 30
@@ -27,7 +27,7 @@ NEAREST = 1e-4  # m, in front of the sensor that a point has at least
 
 
 @dataclass(frozen=True)
-class Seen:
+class Sightings:
     """N observations of unknown points from known poses, sorted by track and step."""
 
     z: Array  # (N, 3), u, v, d in px
@@ -37,21 +37,21 @@ class Seen:
     step: Indices  # (N,)
     moving: Array  # (N,) of bool
 
-    def keep(self, chosen: Array) -> Seen:
+    def keep(self, chosen: Array) -> Sightings:
         """The rows for which ``chosen`` (N,) is true."""
-        return Seen(*(value[chosen] for value in vars(self).values()))
+        return Sightings(*(value[chosen] for value in vars(self).values()))
 
-    def long_enough(self) -> Seen:
+    def long_enough(self) -> Sightings:
         """The rows of tracks with enough observations."""
         _, where, count = np.unique(self.track, return_inverse=True, return_counts=True)
         return self.keep(count[where] >= SHORTEST)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class PointFit:
     """Residuals about fitted points, N rows as in ``seen``."""
 
-    seen: Seen
+    seen: Sightings
     ideal: Array  # (N, 3), px, projections of the fitted points
     r: Array  # (N, 3), px
     free: Array  # (N, 3), 1 - h: share of each observation that the fit leaves
@@ -76,13 +76,13 @@ class Fitted:
 
 
 def fit_points(
-    seen: Seen,
+    seen: Sightings,
     f: float,
     B: float,
     parts: Indices,
     start: Array,
     free_poses: bool = False,
-) -> Fitted:
+) -> PointFit:
     """Fit the point of each track and the noise of each component, in turns until both stay.
 
     Parameters
@@ -122,16 +122,16 @@ def fit_points(
         sigma = np.maximum(new, 1e-9)
         if change < SETTLED:
             break
-    return Fitted(seen, seen.z - r, r, free, parts, sigma, neighbours)
+    return PointFit(seen, seen.z - r, r, free, parts, sigma, neighbours)
 
 
-def _moved(seen: Seen, moves: Array) -> Seen:
+def _moved(seen: Sightings, moves: Array) -> Sightings:
     """A copy with poses moved by shifts and rotation vectors (N, 6) in sensor axes."""
     t = seen.t + np.einsum("nij,nj->ni", seen.R, moves[:, :3])
     return replace(seen, R=seen.R @ Rotation.from_rotvec(moves[:, 3:]).as_matrix(), t=t)
 
 
-def without_gross(fitted: Fitted) -> Array:
+def without_gross(fitted: PointFit) -> Array:
     """Rows (N,) of tracks whose residuals are all within ``GROSS`` robust standard deviations of their component."""
     scaled = np.abs(fitted.r / np.sqrt(np.maximum(fitted.free, 0.05)))
     limit = np.empty(len(fitted.sigma))
@@ -141,7 +141,7 @@ def without_gross(fitted: Fitted) -> Array:
     return ~np.isin(fitted.seen.track, fitted.seen.track[wrong])
 
 
-def _first_points(seen: Seen, f: float, B: float) -> Array:
+def _first_points(seen: Sightings, f: float, B: float) -> Array:
     """Points (tracks, 3) from the nearest observation of each, m in the world."""
     _, first = np.unique(seen.track, return_index=True)
     best = np.lexsort((-seen.z[:, 2], seen.track))[first]
@@ -150,7 +150,7 @@ def _first_points(seen: Seen, f: float, B: float) -> Array:
     return np.einsum("nij,nj->ni", seen.R[best], local) + seen.t[best]
 
 
-def _groups(seen: Seen) -> Iterator[tuple[Indices, Indices]]:
+def _groups(seen: Sightings) -> Iterator[tuple[Indices, Indices]]:
     """Tracks (T,) of one length n and their rows (T, n), so that all are worked on at once."""
     _, first, count = np.unique(seen.track, return_index=True, return_counts=True)
     for n in np.unique(count):

@@ -29,8 +29,8 @@ from consistency.stereo.characterising.coordinate_fit import (
     tails,
     wider,
 )
-from consistency.stereo.characterising.log_residuals import MARGIN, octaves, within_limits
-from consistency.stereo.characterising.unknown_landmarks import Fitted, Seen, fit_points, without_gross
+from consistency.stereo.characterising.point_fit import PointFit, Sightings, fit_points, without_gross
+from consistency.stereo.characterising.truth_residuals import MARGIN, octaves, within_limits
 
 FREE = 0.1  # share of a value that the fits must leave for it to tell of the shape of the noise
 FIXED = (
@@ -41,7 +41,7 @@ HIDDEN = "Where noise is correlated along a track, the fitted points take part o
 
 
 def characterise_posed(
-    seen: Seen,
+    seen: Sightings,
     sensor: PicturedSensor,
     source: str,
     notes: tuple[str, ...] = (),
@@ -101,7 +101,7 @@ def characterise_posed(
     )
 
 
-def _require_enough(seen: Seen, total: int, source: str) -> None:
+def _require_enough(seen: Sightings, total: int, source: str) -> None:
     tracks = len(np.unique(seen.track))
     if len(seen.z) < LEAST or tracks < LEAST_TRACKS:
         raise InputError(
@@ -110,12 +110,12 @@ def _require_enough(seen: Seen, total: int, source: str) -> None:
         )
 
 
-def coordinates_as_parts(seen: Seen) -> Indices:
+def coordinates_as_parts(seen: Sightings) -> Indices:
     """Components (N, 3) of a noise that each coordinate has one of."""
     return np.tile(np.arange(3), (len(seen.z), 1))
 
 
-def _disparity_nodes(plain: Fitted) -> tuple[Array, Indices | None]:
+def _disparity_nodes(plain: PointFit) -> tuple[Array, Indices | None]:
     """Nodes (m,) of disparity, and the nearest to each row (N,); None where the data are too few for two nodes."""
     d = np.maximum(plain.ideal[:, 2], 1e-3)
     nodes = octaves(d)
@@ -125,7 +125,9 @@ def _disparity_nodes(plain: Fitted) -> tuple[Array, Indices | None]:
     return nodes, nearest
 
 
-def _fit_by_disparity(plain: Fitted, nearest: Indices, nodes: int, sensor: PicturedSensor, free_poses: bool) -> Fitted:
+def _fit_by_disparity(
+    plain: PointFit, nearest: Indices, nodes: int, sensor: PicturedSensor, free_poses: bool
+) -> PointFit:
     """The fit in which the disparity has a noise of its own around each node."""
     parts = coordinates_as_parts(plain.seen)
     parts[:, 2] += nearest
@@ -133,7 +135,7 @@ def _fit_by_disparity(plain: Fitted, nearest: Indices, nodes: int, sensor: Pictu
     return fit_points(plain.seen, *sensor.rig, parts, start, free_poses)
 
 
-def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple[Interval, float]:
+def log_interval(of: PointFit, chosen: Array, sigma: float, level: float) -> tuple[Interval, float]:
     """Standard deviation of the values in ``chosen`` (N, 3), and the variance of its log.
 
     The wider of two: chi-square with the degrees of freedom that are left, for Gaussian noise, and the scatter of the
@@ -150,7 +152,7 @@ def log_interval(of: Fitted, chosen: Array, sigma: float, level: float) -> tuple
     return interval, max(gaussian, any_noise) ** 2
 
 
-def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
+def _growth(nodes: Array, of: PointFit, levels: Levels) -> DisparityNoise:
     intervals = []
     weights = np.empty(len(nodes))
     for j in range(len(nodes)):
@@ -165,7 +167,7 @@ def _growth(nodes: Array, of: Fitted, levels: Levels) -> DisparityNoise:
     return DisparityNoise(nodes, tuple(intervals), p_value, p_value < levels.rate / 6)
 
 
-def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate:
+def _coordinate(k: int, of: PointFit, plain: PointFit, levels: Levels) -> Coordinate:
     interval, _ = log_interval(plain, plain.parts == k, plain.sigma[k], levels.of("sigma"))
     scaled = of.scaled[of.free[:, k] > FREE, k]
     lags, bounds, correlation = correlations(of, k, levels.of("correlation"))
@@ -183,7 +185,7 @@ def _coordinate(k: int, of: Fitted, plain: Fitted, levels: Levels) -> Coordinate
     )
 
 
-def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interval | None]:
+def correlations(of: PointFit, k: int, level: float) -> tuple[Array, Array, Interval | None]:
     """Autocorrelation (lags,) along tracks of coordinate ``k``, its 95 % bound if white, and the interval of lag 1.
 
     The fit of a point correlates the residuals of a track; what it does to neighbours is taken off. It also hides part
@@ -213,7 +215,7 @@ def correlations(of: Fitted, k: int, level: float) -> tuple[Array, Array, Interv
     return lags, bounds, Interval(value, max(value - half, -1.0), min(value + half, 1.0))
 
 
-def _shared(of: Fitted, free_poses: bool) -> tuple[str, ...]:
+def _shared(of: PointFit, free_poses: bool) -> tuple[str, ...]:
     """A note on what all landmarks of a step have in common, which is the poses' or the rig's and not the noise's."""
     _, where, count = np.unique(of.seen.step, return_inverse=True, return_counts=True)
     pairs = (count * (count - 1)).sum()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, stats
@@ -19,8 +19,7 @@ TRACKS = 3  # that a node needs
 UNSURE = 5.0  # px, standard deviation of the prior that keeps a node without data from being singular
 
 
-@dataclass(frozen=True)
-class Grid:
+class Grid(NamedTuple):
     """Nodes of the image, and which have data; K across, L down."""
 
     u: Array  # (K,), px from the principal point
@@ -48,8 +47,7 @@ def grid_of(data: Residuals, u: Array, v: Array) -> Grid:
     return Grid(u, v, rows, (rows >= FEW) & (tracks >= TRACKS))
 
 
-@dataclass(frozen=True)
-class BiasEstimate:
+class BiasEstimate(NamedTuple):
     """Bias of u, v, d at the nodes of a grid."""
 
     grid: Grid

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -32,8 +32,7 @@ NO_TIME = (
 )
 
 
-@dataclass(frozen=True)
-class Corners:
+class Corners(NamedTuple):
     """Inner corners of a board in both images of n pairs."""
 
     left: Array  # (n, c, 2), px
@@ -49,8 +48,7 @@ class Corners:
         return [self.board.astype(np.float32)] * len(self.left)
 
 
-@dataclass(frozen=True)
-class BoardCalibration:
+class BoardCalibration(NamedTuple):
     """Corners of one calibration in rectified pixels."""
 
     model: str

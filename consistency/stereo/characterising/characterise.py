@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class Coordinate:
         return self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12))
 
 
-@dataclass(frozen=True)
-class DisparityNoise:
+class DisparityNoise(NamedTuple):
     """Standard deviation of disparity by disparity."""
 
     nodes: Array  # (m,), px

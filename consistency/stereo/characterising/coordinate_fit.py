@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, special, stats
@@ -162,8 +163,7 @@ def autocorrelation(fit: LikelihoodFit) -> tuple[Array, Array]:
     return values, bounds
 
 
-@dataclass(frozen=True)
-class Mixture:
+class Mixture(NamedTuple):
     """Two normal distributions about zero."""
 
     share: float  # of the wide one
@@ -171,8 +171,7 @@ class Mixture:
     wide: float  # standard deviation of the wide one, likewise
 
 
-@dataclass(frozen=True)
-class ResidualTails:
+class ResidualTails(NamedTuple):
     """Shape of standardised residuals."""
 
     weight: Interval  # 1 / nu of Student's distribution; 0 is the normal one

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -54,8 +54,7 @@ class SourceOptions:
         return [f"--{name}" for name, value in vars(self).items() if name not in both and value is not None]
 
 
-@dataclass(frozen=True)
-class MeasuredSensor:
+class MeasuredSensor(NamedTuple):
     """A characterisation and what of the source's file stays as it was."""
 
     of: Characterisation

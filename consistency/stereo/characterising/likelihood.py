@@ -8,6 +8,7 @@ maximise the likelihood of what the regression leaves, so that the degrees of fr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -46,8 +47,7 @@ class Rows:
         return np.searchsorted(self.first, np.arange(len(self.r)), side="right") - 1
 
 
-@dataclass(frozen=True)
-class Parameters:
+class Parameters(NamedTuple):
     """Noise of one coordinate."""
 
     a: Array  # (m,), px, standard deviation of the noise at the nodes
@@ -55,8 +55,7 @@ class Parameters:
     ratio: float  # q: variance of the offsets over that of the noise; may be a little below 0
 
 
-@dataclass(frozen=True)
-class Whitened:
+class Whitened(NamedTuple):
     """Rows freed of their correlation, and what that costs in each track."""
 
     values: Array  # (N, columns)
@@ -88,8 +87,7 @@ def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
     return Whitened(x, log_variance)
 
 
-@dataclass(frozen=True)
-class Regression:
+class Regression(NamedTuple):
     """Generalised least squares at some parameters."""
 
     beta: Array  # (p,)
@@ -118,8 +116,7 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
     return Regression(beta, np.linalg.inv(normal), e, X, value)
 
 
-@dataclass(frozen=True)
-class LikelihoodFit:
+class LikelihoodFit(NamedTuple):
     """The largest restricted likelihood and what is known of its place."""
 
     rows: Rows
@@ -135,8 +132,7 @@ class LikelihoodFit:
         return len(self.rows.first)
 
 
-@dataclass(frozen=True)
-class Likelihood:
+class Likelihood(NamedTuple):
     """Likelihood of rows over log a, atanh rho and log(1 + n q), on which estimates are nearly Gaussian."""
 
     rows: Rows

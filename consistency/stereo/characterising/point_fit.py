@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,8 +48,7 @@ class Sightings:
         return self.keep(count[where] >= SHORTEST)
 
 
-@dataclass(frozen=True)
-class PointFit:
+class PointFit(NamedTuple):
     """Residuals about fitted points, N rows as in ``seen``."""
 
     seen: Sightings
@@ -158,8 +158,7 @@ def _groups(seen: Sightings) -> Iterator[tuple[Indices, Indices]]:
         yield tracks, first[tracks][:, None] + np.arange(n)
 
 
-@dataclass(frozen=True)
-class Slopes:
+class Slopes(NamedTuple):
     """Residuals and derivatives of T tracks of n observations, by the standard deviations of the values."""
 
     r: Array  # (T, n, 3)
@@ -197,8 +196,7 @@ def slopes_of(
     return Slopes((z - predicted) / sigma, by_point, by_pose, cov)
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """What one step of least squares does to T tracks of n observations, in standard deviations."""
 
     points: Array  # (T, 3), m

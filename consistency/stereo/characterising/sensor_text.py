@@ -241,7 +241,7 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
         "skewness": c.tails.skewness,
         "excess_kurtosis": c.tails.excess_kurtosis,
         "normality_p": c.tails.p_value,
-        "mixture": c.tails.mixture and vars(c.tails.mixture),
+        "mixture": c.tails.mixture and c.tails.mixture._asdict(),
         "pooled": c.pooled,
         "about_tracks": c.about_tracks,
         "autocorrelation": c.lags,

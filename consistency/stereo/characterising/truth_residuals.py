@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,8 +102,7 @@ def moved_before(poses: Array) -> Array:
     return np.append(False, moved)
 
 
-@dataclass(frozen=True)
-class RowSelection:
+class RowSelection(NamedTuple):
     """The rows that the noise is estimated from, and the others."""
 
     kept: Residuals

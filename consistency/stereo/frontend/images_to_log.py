@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -49,8 +50,7 @@ class FrontendOptions:
     settings: MotionSettings = field(default_factory=MotionSettings)
 
 
-@dataclass(frozen=True)
-class Summary:
+class Summary(NamedTuple):
     """A built log, and what it is of."""
 
     sequence: Sequence

@@ -5,7 +5,7 @@ Motions in space become those of a robot on a plane: forward, left, up, and the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -41,8 +41,7 @@ WITHIN = 30.0  # degrees between optical axis and motion; a camera that looks el
 MOVED = 0.1  # m over the whole sequence; below, a rig that stands still has no direction
 
 
-@dataclass(frozen=True)
-class Plane:
+class Plane(NamedTuple):
     """How well motions in space are those of a robot on a plane.
 
     The log's sigma says how far landmarks are off when they are seen along the planar path. A landmark that is off by

@@ -7,7 +7,7 @@ faces the camera, and on a slanted one too narrow along the slant.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -22,8 +22,7 @@ REACH = 4.0  # sd of the point spread beyond which the border of a layer is not 
 COARSE = 8  # px between the rays by which a layer is found in the image
 
 
-@dataclass(frozen=True, eq=False)
-class StereoFrame:
+class StereoFrame(NamedTuple):
     """One image pair and where it was taken."""
 
     left: Array  # (h, w), 8-bit

@@ -7,7 +7,7 @@ Correspondence (5): disparities of features from the images of a pair. Filtering
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -299,8 +299,7 @@ class KnownDisparity:
         return np.full(len(uv), np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class PairObservations:
+class PairObservations(NamedTuple):
     """N observations of one image pair, as a filter of observations is given them; the truth is not among them."""
 
     left: Array  # (h, w), 8-bit

@@ -8,7 +8,8 @@ no estimate of a filter is used.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,8 +31,7 @@ NEAREST = 0.5  # m, depth of a point that a fit may move behind the camera
 MAD = 1.4826  # standard deviation over median deviation, of a Gaussian
 
 
-@dataclass(frozen=True)
-class Screened:
+class Screened(NamedTuple):
     """Trials in which landmarks restart where they leave the common motion, and how often they do."""
 
     trials: list[Trial]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -89,8 +90,7 @@ def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
     )
 
 
-@dataclass(frozen=True)
-class StereoFeatures:
+class StereoFeatures(NamedTuple):
     """Features of both images of a stereo pair and their matches, row by row of ``pairs``."""
 
     left: Features

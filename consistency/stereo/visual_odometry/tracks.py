@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -40,8 +40,7 @@ def linked(links: Sequence[Indices]) -> list[Indices]:
     return tracks
 
 
-@dataclass(frozen=True)
-class TrackSelection:
+class TrackSelection(NamedTuple):
     """Which observations become those of landmarks."""
 
     slots: int  # landmarks seen at once, at most

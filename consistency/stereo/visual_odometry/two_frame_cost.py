@@ -7,7 +7,7 @@ that each q is eliminated from the second derivatives by itself (Schur complemen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
 
 
-@dataclass(frozen=True, eq=False)
-class TwoFrames:
+class TwoFrames(NamedTuple):
     """Measurements of the same points in two frames."""
 
     measure: PointMatches | PixelMatches
@@ -35,8 +34,7 @@ class TwoFrames:
         return np.where(np.isnan(s), np.inf, s)
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Of f of each point by the pose d = (x, y, z, roll, pitch, yaw), by q and by z1 and z2."""
 
     d: Array  # (N, 6)

@@ -6,6 +6,7 @@ Rectification makes their images ones without distortion whose rows correspond: 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,8 +70,7 @@ class PairCalibration:
             )
 
 
-@dataclass(frozen=True)
-class Rectification:
+class Rectification(NamedTuple):
     """The rig of the rectified images, and how raw images become rectified."""
 
     rig: StereoRig

@@ -39,6 +39,7 @@ def visual_odometry(
     InputError
         An image that cannot be read; too few motions could be measured.
     """
+    settings = settings or MotionSettings()
     rig = sequence.rectification.rig
     motions = list[RelativeMotion | InputError]()
     with progress(sequence.folder.name, len(sequence), "stereo pairs") as advance:
@@ -46,10 +47,10 @@ def visual_odometry(
         names = ("", "")
         for frame, path in enumerate(sequence.left):
             names = (names[1], path.name)
-            after = stereo_features(rig, *sequence.pair(frame), settings=settings, name=path.name)
+            after = stereo_features(rig, *sequence.pair(frame), settings, path.name)
             if before is not None:
                 try:
-                    motions.append(motion_between(rig, before, after, rng=rng, settings=settings, names=names))
+                    motions.append(motion_between(rig, before, after, settings, rng, names))
                 except InputError as fault:
                     motions.append(fault)
             before = after

@@ -140,21 +140,17 @@ def relative_motion(
         The matches do not agree on a motion, or do not fix one; all are InputErrors.
     """
     settings = settings or MotionSettings()
-    first = stereo_features(rig, *before, settings=settings, name="before")
-    second = stereo_features(rig, *after, settings=settings, name="after")
-    motion = motion_between(rig, first, second, rng=rng, settings=settings, estimator=estimator)
+    if estimator is not None:
+        settings = replace(settings, estimator=estimator)
+    first = stereo_features(rig, *before, settings, "before")
+    second = stereo_features(rig, *after, settings, "after")
+    motion = motion_between(rig, first, second, settings, rng, ("before", "after"))
     if motion.doubt:
         warnings.warn(motion.doubt, stacklevel=2)
     return motion
 
 
-def stereo_features(
-    rig: StereoRig,
-    left: Array,
-    right: Array,
-    settings: MotionSettings | None = None,
-    name: str = "pair",
-) -> StereoFeatures:
+def stereo_features(rig: StereoRig, left: Array, right: Array, settings: MotionSettings, name: str) -> StereoFeatures:
     """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
 
     Raises
@@ -162,7 +158,6 @@ def stereo_features(
     InputError
         As :func:`relative_motion`.
     """
-    settings = settings or MotionSettings()
     left = _grey_of_rig(rig, left, f"{name} left")
     right = _grey_of_rig(rig, right, f"{name} right")
     with ThreadPoolExecutor(2) as pool:  # OpenCV holds no lock, and uses a core and a half of its own accord
@@ -182,16 +177,11 @@ def motion_between(
     rig: StereoRig,
     before: StereoFeatures,
     after: StereoFeatures,
-    *,
+    settings: MotionSettings,
     rng: np.random.Generator,
-    settings: MotionSettings | None = None,
-    estimator: str | None = None,
-    names: tuple[str, str] = ("before", "after"),
+    names: tuple[str, str],
 ) -> RelativeMotion:
     """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
-    settings = settings or MotionSettings()
-    if estimator is not None:
-        settings = replace(settings, estimator=estimator)
     rows = circular_matches(before, after, settings.ratio)
     uv0 = pixels(before)[rows[:, 0]]
     uv1 = pixels(after)[rows[:, 1]]

@@ -72,46 +72,45 @@ def read_opencv(path: Path) -> PairCalibration:
     of D1, D2 and R is left out, another list or matrix of an unknown name may be that one misspelt, and is refused.
     """
     keys = read_yaml(path)
-    matrices: dict[str, Array] = {}
-    for key, names in OPENCV_KEYS.items():
-        there = [name for name in names if name in keys]
-        if there:
-            matrices[key] = keys.matrix(there[0])
-        elif "T_BS" in keys:
-            raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
-        elif key in ("K1", "K2", "T"):
+    used = {key: [name for name in names if name in keys] for key, names in OPENCV_KEYS.items()}
+    missing = [key for key, names in used.items() if not names]
+    if missing and "T_BS" in keys:
+        raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
+    for key in missing:
+        if key in ("K1", "K2", "T"):
             known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
             raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
-    _require_known(keys, [key for key in ("D1", "D2", "R") if key not in matrices])
-    matrices = {"D1": np.zeros(4), "D2": np.zeros(4), "R": np.eye(3)} | matrices
-    sizes = [int(keys.number(key)) for key in SIZE_KEYS if key in keys]
+    _require_known(keys, missing)
+    R = np.eye(3)
+    if used["R"]:
+        R = keys.numbers(used["R"][0], 9).reshape(3, 3)
     image_size = None
-    if sizes:
-        image_size = (sizes[0], sizes[1])
+    if SIZE_KEYS[0] in keys:
+        image_size = int(keys.number("image_width")), int(keys.number("image_height"))
     return PairCalibration(
         str(path),
-        K_left=_shaped(path, matrices, "K1", (3, 3)),
-        K_right=_shaped(path, matrices, "K2", (3, 3)),
-        D_left=_distortion(path, "D1", matrices["D1"]),
-        D_right=_distortion(path, "D2", matrices["D2"]),
-        R=_shaped(path, matrices, "R", (3, 3)),
-        T=_shaped(path, matrices, "T", (3,)),
+        K_left=keys.numbers(used["K1"][0], 9).reshape(3, 3),
+        K_right=keys.numbers(used["K2"][0], 9).reshape(3, 3),
+        D_left=_opencv_distortion(keys, used["D1"]),
+        D_right=_opencv_distortion(keys, used["D2"]),
+        R=R,
+        T=keys.numbers(used["T"][0], 3),
         image_size=image_size,
     )
 
 
-def _shaped(path: Path, matrices: dict[str, Array], key: str, shape: tuple[int, ...]) -> Array:
-    matrix = matrices[key]
-    if matrix.size != np.prod(shape):
-        raise InputError(f"{path}: key '{key}': has {matrix.size} numbers, not {np.prod(shape)}")
-    return matrix.reshape(shape)
+def _opencv_distortion(keys: YamlKeys, names: list[str]) -> Array:
+    if not names:
+        return np.zeros(4)
+    return _distortion(keys, names[0])
 
 
-def _distortion(path: Path, key: str, coefficients: Array) -> Array:
+def _distortion(keys: YamlKeys, name: str) -> Array:
+    coefficients = keys.matrix(name).ravel()
     if coefficients.size not in COUNTS:
         counts = ", ".join(map(str, COUNTS))
-        raise InputError(f"{path}: key '{key}': has {coefficients.size} coefficients, not {counts}")
-    return coefficients.ravel()
+        raise InputError(f"{keys.path}: key '{name}': has {coefficients.size} coefficients, not {counts}")
+    return coefficients
 
 
 def _require_known(keys: YamlKeys, missing: list[str]) -> None:
@@ -178,7 +177,7 @@ def _euroc_camera(folder: Path, camera: str) -> _Camera:
     return _Camera(
         path,
         K=_pinhole(*keys.numbers("intrinsics", 4)),
-        D=_distortion(path, "distortion_coefficients", keys.matrix("distortion_coefficients")),
+        D=_distortion(keys, "distortion_coefficients"),
         size=(width, height),
         pose=keys.numbers("T_BS", 16).reshape(4, 4),
     )

@@ -165,7 +165,8 @@ class Likelihood(NamedTuple):
         """Log-likelihood (K,) of the residuals (N, 1) of each track, likewise."""
         white = whiten_rows(self.rows, r, self.parameters(x))
         assert white is not None
-        return -0.5 * (white.log_variance + np.add.reduceat(white.values[:, 0] ** 2, self.rows.first))
+        squares = np.add.reduceat(white.values[:, 0] ** 2, self.rows.first)
+        return -0.5 * (white.log_variance + squares)
 
 
 def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
@@ -224,7 +225,9 @@ def _climb(likelihood: Likelihood, x: Array) -> tuple[Array, Array]:
             raise ValueError(UNDETERMINED)
         slope = np.empty(len(x))
         for i, d in enumerate(STEP * np.eye(len(x))):
-            slope[i] = (likelihood.restricted(x + d) - likelihood.restricted(x - d)) / (2.0 * STEP)
+            up = likelihood.restricted(x + d)
+            down = likelihood.restricted(x - d)
+            slope[i] = (up - down) / (2.0 * STEP)
         step = -np.linalg.solve(H, slope)
         if slope @ -step < NEAR:
             return x, H
@@ -256,5 +259,7 @@ def _scores(likelihood: Likelihood, x: Array, beta: Array) -> Array:
     r = (rows.r - rows.X @ beta)[:, None]
     scores = np.empty((len(rows.first), len(x)))
     for i, d in enumerate(STEP * np.eye(len(x))):
-        scores[:, i] = (likelihood.of_tracks(x + d, r) - likelihood.of_tracks(x - d, r)) / (2.0 * STEP)
+        up = likelihood.of_tracks(x + d, r)
+        down = likelihood.of_tracks(x - d, r)
+        scores[:, i] = (up - down) / (2.0 * STEP)
     return scores - scores.mean(axis=0)

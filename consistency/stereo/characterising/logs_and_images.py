@@ -64,6 +64,7 @@ def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
         ``text`` is something else, or one of them is below ``least``.
     """
     one, cross, two = text.lower().partition("x")
-    if not (cross and one.isdecimal() and two.isdecimal() and min(int(one), int(two)) >= least):
+    are_numbers = one.isdecimal() and two.isdecimal()
+    if not cross or not are_numbers or min(int(one), int(two)) < least:
         raise InputError(f"{option} {text}: must be two numbers of at least {least}, as 9x6")
     return int(one), int(two)

@@ -103,7 +103,8 @@ def fit_points(
         s = sigma[parts]
         slopes = []
         for tracks, rows in groups:
-            slopes.append(slopes_of(seen.z[rows], seen.R[rows], seen.t[rows], points[tracks], f, B, s[rows]))
+            own = slopes_of(seen.z[rows], seen.R[rows], seen.t[rows], points[tracks], f, B, s[rows])
+            slopes.append(own)
         if free_poses:
             done, moves = steps_of_both(slopes, steps_of_groups, len(steps))
             seen = _moved(seen, moves[step_of_row])
@@ -128,7 +129,8 @@ def fit_points(
 def _moved(seen: Sightings, moves: Array) -> Sightings:
     """A copy with poses moved by shifts and rotation vectors (N, 6) in sensor axes."""
     t = seen.t + np.einsum("nij,nj->ni", seen.R, moves[:, :3])
-    return replace(seen, R=seen.R @ Rotation.from_rotvec(moves[:, 3:]).as_matrix(), t=t)
+    turn = Rotation.from_rotvec(moves[:, 3:]).as_matrix()
+    return replace(seen, R=seen.R @ turn, t=t)
 
 
 def without_gross(fitted: PointFit) -> Array:

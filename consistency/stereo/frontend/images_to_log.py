@@ -5,6 +5,7 @@ Trajectories are texts that `consistency analyse` and the usual tools read.
 
 from __future__ import annotations
 
+import io
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -253,8 +254,7 @@ def motions_text(
 
 
 def _lines(stamps: Array, values: Array) -> str:
-    lines = []
-    for stamp, row in zip(stamps, values, strict=True):
-        numbers = " ".join(f"{value:.17g}" for value in row)
-        lines.append(f"{stamp:.9f} {numbers}\n")
-    return "".join(lines)
+    text = io.StringIO()
+    formats = ["%.9f"] + ["%.17g"] * values.shape[1]
+    np.savetxt(text, np.column_stack([stamps, values]), formats)
+    return text.getvalue()

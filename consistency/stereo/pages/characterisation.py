@@ -172,16 +172,18 @@ def _correlation(of: Characterisation) -> tuple[Figure, ...]:
 
 
 def _draw_lags(of: Characterisation) -> Drawing:
-    found = np.concatenate([np.abs(c.lags[np.isfinite(c.lags)]) for c in of.coordinates])
-    reach = 1.15 * max(found.max(), 0.1)
+    largest = np.nanmax([c.lags for c in of.coordinates])
+    smallest = np.nanmin([c.lags for c in of.coordinates])
+    reach = 1.15 * max(largest, -smallest, 0.1)
     figure, panels = canvas(1.5, 3, 3)
     for c, axes in zip(of.coordinates, panels, strict=True):
         lags = np.flatnonzero(np.isfinite(c.lags)) + 1
+        values = c.lags[lags - 1]
         bound = np.nanmax(c.bounds)
         axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
         axes.axhline(0.0, **stroke(EXPECTED))
-        axes.vlines(lags, 0.0, c.lags[lags - 1], color=MEASURED.colour, linewidth=MEASURED.width)
-        axes.plot(lags, c.lags[lags - 1], **dots(MEASURED))
+        axes.vlines(lags, 0.0, values, color=MEASURED.colour, linewidth=MEASURED.width)
+        axes.plot(lags, values, **dots(MEASURED))
         ticks = lags[:: max(1, len(lags) // 5)]
         axes.set(xlabel="lag (steps)", ylabel="correlation", title=c.name, ylim=(-reach, reach), xticks=ticks)
     return figure

@@ -50,7 +50,8 @@ def grey(image: Array, name: str = "image") -> Array:
     image = np.asarray(image)
     if image.dtype.kind not in "uif" or image.size == 0:
         raise InputError(f"{name}: is not an image, but an array of {image.dtype} with shape {image.shape}")
-    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
+    is_colour = image.ndim == 3 and image.shape[2] in (1, 3, 4)
+    if image.ndim != 2 and not is_colour:
         raise InputError(f"{name}: shape {image.shape}; an image is (h, w) or (h, w, 3)")
     if image.dtype == np.uint8 and image.ndim == 2:
         return np.ascontiguousarray(image)

@@ -60,7 +60,8 @@ def loss(robust: Robust | None, s: Array, c: float) -> tuple[Array, Array, Array
         return rho, weight, np.where(s > c**2, -0.5 * weight / far, 0.0)
     if robust == "cauchy":
         weight = 1.0 / (1.0 + s / c**2)
-        return c**2 * np.log1p(s / c**2), weight, -(weight**2) / c**2
+        rho = c**2 * np.log1p(s / c**2)
+        return rho, weight, -(weight**2) / c**2
     raise InputError(f"robust: {robust!r}, allowed are 'huber', 'cauchy' and None")
 
 

@@ -196,7 +196,11 @@ def _required_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[st
 
 
 def _images(folder: Path, pattern: str = "*") -> list[Path]:
-    return sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    found = []
+    for path in folder.glob(pattern):
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+            found.append(path)
+    return sorted(found)
 
 
 def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array | None) -> None:

@@ -63,7 +63,8 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     speed = np.array([_twist(motion.pose) for motion in motions]) / dt[:, None]
     rate = np.zeros_like(speed)
     if len(motions) > 1:
-        rate = np.gradient(speed, 0.5 * (t[1:] + t[:-1]), axis=0)
+        middle = 0.5 * (t[1:] + t[:-1])
+        rate = np.gradient(speed, middle, axis=0)
     J = np.empty((len(motions), 6, len(SHARED)))
     for k, motion in enumerate(motions):
         J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)
@@ -73,7 +74,8 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
             J[k, :, :RIG] = _by_rig(rig, motion)
     for k in np.flatnonzero(~measured).tolist():
         around, share = neighbours(measured, t, k)
-        J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
+        weights = dt[k] * share / dt[around]
+        J[k, :, :RIG] = np.tensordot(weights, J[around, :, :RIG], axes=1)
     return J
 
 

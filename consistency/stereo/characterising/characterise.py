@@ -45,7 +45,9 @@ class Coordinate:
     @property
     def white(self) -> bool | None:
         """Whether no correlation is shown; None where it cannot be told."""
-        return None if self.correlation is None else self.correlation.holds(0.0)
+        if self.correlation is None:
+            return None
+        return self.correlation.holds(0.0)
 
     @property
     def offset_px(self) -> float:

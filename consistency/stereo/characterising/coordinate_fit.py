@@ -102,7 +102,7 @@ def growth_p_value(fit: LikelihoodFit) -> float:
     values = []
     for C in (fit.cov, fit.robust):
         S = contrast @ C[:m, :m] @ contrast.T
-        values.append(stats.chi2.sf(gap @ np.linalg.solve(S, gap), m - 1))
+        values.append(float(stats.chi2.sf(gap @ np.linalg.solve(S, gap), m - 1)))
     return max(values)
 
 

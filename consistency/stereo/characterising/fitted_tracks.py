@@ -163,7 +163,7 @@ def _growth(nodes: Array, of: PointFit, levels: Levels) -> DisparityNoise:
     logs = np.log(of.sigma[2:])
     mean = (logs * weights).sum() / weights.sum()
     chi2 = ((logs - mean) ** 2 * weights).sum()
-    p_value = stats.chi2.sf(chi2, len(nodes) - 1)
+    p_value = float(stats.chi2.sf(chi2, len(nodes) - 1))
     return DisparityNoise(nodes, tuple(intervals), p_value, p_value < levels.rate / 6)
 
 
@@ -205,11 +205,11 @@ def correlations(of: PointFit, k: int, level: float) -> tuple[Array, Array, Inte
     by_fit = of.neighbours[:, k] / sigma**2
     products = e[pair] * e[pair - 1] - by_fit[pair]
     weight = np.sqrt(np.maximum(free[pair] * free[pair - 1], 0.0))
-    value = products.sum() / weight.sum()
+    value = float(products.sum() / weight.sum())
     _, where = np.unique(seen.track[pair], return_inverse=True)
     of_tracks = np.bincount(where, products - value * weight)
-    error = np.sqrt((of_tracks**2).sum()) / weight.sum()
-    half = error * stats.t.isf(level / 2, max(where.max(), 1))
+    error = float(np.sqrt((of_tracks**2).sum()) / weight.sum())
+    half = error * float(stats.t.isf(level / 2, max(where.max(), 1)))
     lags[0] = value
     bounds[0] = 1.96 * error
     return lags, bounds, Interval(value, max(value - half, -1.0), min(value + half, 1.0))

@@ -19,7 +19,7 @@ from consistency.stereo.characterising.boards import (
     find_corners,
     residuals_about_boards,
 )
-from consistency.stereo.characterising.fitted_tracks import characterise_posed, correlations, log_interval
+from consistency.stereo.characterising.fitted_tracks import HIDDEN, characterise_posed, correlations, log_interval
 from consistency.stereo.characterising.from_log import seen_of as seen_of_log
 from consistency.stereo.characterising.point_fit import Sightings, fit_points, without_gross
 
@@ -123,6 +123,13 @@ def test_correlation_is_found_and_not_that_of_the_fit(rng):
     fitted = fit_points(coloured, F, B, parts(coloured), np.ones(3))
     _, _, interval = correlations(fitted, 0, LEVEL)
     assert 0.3 < interval.low < interval.value < 0.65
+
+
+def test_a_note_says_where_correlation_makes_sigma_a_lower_limit(rng):
+    """By chance it is missing only if a correlation of 0.9 looks like none, which is 30 standard errors away."""
+    of = characterise_posed(seen_of(rng, 200, 30, rho=0.9), SENSOR, "here")
+    assert of.coordinates[0].white is False
+    assert HIDDEN in of.notes
 
 
 def test_a_track_with_a_mismatch_is_left_out_as_a_whole(rng):

@@ -28,6 +28,7 @@ OPENCV_KEYS = {
 OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
 OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
 OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
+NUMBERS = {"K1": 9, "K2": 9, "R": 9, "T": 3}  # of matrices whose size is fixed
 SIZE_KEYS = ("image_width", "image_height")
 EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
 NO_DISTORTION = ("none", "")
@@ -72,37 +73,35 @@ def read_opencv(path: Path) -> PairCalibration:
     of D1, D2 and R is left out, another list or matrix of an unknown name may be that one misspelt, and is refused.
     """
     keys = read_yaml(path)
-    used = {key: [name for name in names if name in keys] for key, names in OPENCV_KEYS.items()}
-    missing = [key for key, names in used.items() if not names]
-    if missing and "T_BS" in keys:
-        raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
-    for key in missing:
-        if key in ("K1", "K2", "T"):
+    matrices = {"D1": np.zeros(4), "D2": np.zeros(4), "R": np.eye(3)}
+    missing = []
+    for key, names in OPENCV_KEYS.items():
+        used = [name for name in names if name in keys]
+        if used and key in NUMBERS:
+            matrices[key] = keys.numbers(used[0], NUMBERS[key])
+        elif used:
+            matrices[key] = _distortion(keys, used[0])
+        elif "T_BS" in keys:
+            raise InputError(f"{path}: is one of the two files of EuRoC; --calibration takes the folder with both")
+        elif key in ("K1", "K2", "T"):
             known = "; ".join(" = ".join(names) for names in OPENCV_KEYS.values())
             raise InputError(f"{path}: key '{key}' is missing; known keys: {known}, image_width, image_height")
+        else:
+            missing.append(key)
     _require_known(keys, missing)
-    R = np.eye(3)
-    if used["R"]:
-        R = keys.numbers(used["R"][0], 9).reshape(3, 3)
     image_size = None
     if SIZE_KEYS[0] in keys:
         image_size = int(keys.number("image_width")), int(keys.number("image_height"))
     return PairCalibration(
         str(path),
-        K_left=keys.numbers(used["K1"][0], 9).reshape(3, 3),
-        K_right=keys.numbers(used["K2"][0], 9).reshape(3, 3),
-        D_left=_opencv_distortion(keys, used["D1"]),
-        D_right=_opencv_distortion(keys, used["D2"]),
-        R=R,
-        T=keys.numbers(used["T"][0], 3),
+        K_left=matrices["K1"].reshape(3, 3),
+        K_right=matrices["K2"].reshape(3, 3),
+        D_left=matrices["D1"],
+        D_right=matrices["D2"],
+        R=matrices["R"].reshape(3, 3),
+        T=matrices["T"],
         image_size=image_size,
     )
-
-
-def _opencv_distortion(keys: YamlKeys, names: list[str]) -> Array:
-    if not names:
-        return np.zeros(4)
-    return _distortion(keys, names[0])
 
 
 def _distortion(keys: YamlKeys, name: str) -> Array:

@@ -171,7 +171,8 @@ def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tu
     else:
         low = -np.array(sensor.centre)
         high = np.array(sensor.image) - sensor.centre
-    return np.linspace(low[0], high[0], grid[0]), np.linspace(low[1], high[1], grid[1])
+    across, down = grid
+    return np.linspace(low[0], high[0], across), np.linspace(low[1], high[1], down)
 
 
 def _coordinate(k: int, of: LikelihoodFit, levels: Levels) -> Coordinate:

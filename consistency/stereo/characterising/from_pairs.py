@@ -74,10 +74,10 @@ def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
     return PicturedSensor(
         model="uvd",
         sigma=(1.0, 1.0, 1.0),
-        f=float(rig.K_left[0, 0]),
-        B=float(rig.baseline),
+        f=rig.f,
+        B=rig.baseline,
         image=rig.image_size,
-        principal_point=(float(rig.K_left[0, 2]), float(rig.K_left[1, 2])),
+        principal_point=rig.principal_point,
     )
 
 

@@ -78,7 +78,8 @@ def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
     energy = np.sign(p.ratio) * size
     if (energy <= -1.0).any():
         return None
-    log_variance = np.add.reduceat(2.0 * np.log(sd) + np.log(left), rows.first) + np.log1p(energy)
+    of_rows = 2.0 * np.log(sd) + np.log(left)
+    log_variance = np.add.reduceat(of_rows, rows.first) + np.log1p(energy)
     x = x[:, :-1]
     if root > 0.0:  # (I - k c c')^2 is the inverse of I + s c c'
         k = (1.0 - 1.0 / np.sqrt(1.0 + energy)) / np.maximum(size, 1e-300)

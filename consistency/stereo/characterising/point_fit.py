@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from consistency.bench.models import stereo
 from consistency.referee.types import Array, Indices
 from consistency.stereo.characterising.truth_residuals import GROSS, MAD, Residuals
+from consistency.stereo.visual_odometry.relative_pose import cross_matrix
 
 SHORTEST = 3  # observations of a track: with two, most of what is seen is used up by the point
 ROUNDS = 30
@@ -185,15 +186,13 @@ def slopes_of(
 ) -> Slopes:
     """Slopes at points (T, 3) seen as ``z`` (T, n, 3) from poses (T, n, 3, 3), (T, n, 3), with noise (T, n, 3)."""
     in_sensor = np.einsum("tnji,tnj->tni", R, points[:, None] - t)
+    in_sensor[..., 0] = np.maximum(in_sensor[..., 0], NEAREST)
     x, y, w = np.moveaxis(in_sensor, -1, 0)
-    x = np.maximum(x, NEAREST)
     predicted = np.stack(stereo.project(x, y, w, f, B), axis=-1)
-    zero = np.zeros_like(x)
     entries = np.stack(stereo.project_jacobian(x, y, w, f, B), axis=-1)
     J = entries.reshape(*x.shape, 3, 3) / sigma[..., None]
     by_point = J @ np.swapaxes(R, -1, -2)
-    turned = np.stack([zero, -w, y, w, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
-    by_pose = np.concatenate([-J, J @ turned], axis=-1)
+    by_pose = np.concatenate([-J, J @ cross_matrix(in_sensor)], axis=-1)
     cov = np.linalg.pinv(np.einsum("tnci,tncj->tij", by_point, by_point), hermitian=True)
     return Slopes((z - predicted) / sigma, by_point, by_pose, cov)
 

@@ -128,7 +128,12 @@ def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSel
     scale[:, 2] = _local_spread(centred[:, 2], data)
     inside = within_limits(data.ideal + fits, MARGIN * scale, sensor)
     gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
-    return RowSelection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+    return RowSelection(
+        data.keep(inside & ~gross),
+        gross=int(gross.sum()),
+        at_limits=int((~inside).sum()),
+        rough=rough,
+    )
 
 
 def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:

@@ -101,9 +101,10 @@ def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
         raise InputError(f"{path}: {len(rows)} poses for {frames} frames; must hold one a frame")
     poses = rows.reshape(-1, 3, 4)
     U, singular, Vt = np.linalg.svd(poses[:, :, :3])
-    if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(U @ Vt) < 0).any():
+    R = U @ Vt
+    if np.abs(singular - 1.0).max() > ROTATION or (np.linalg.det(R) < 0).any():
         raise InputError(f"{path}: holds a rotation that is none; a line must be the 3 x 4 matrix [R t] row by row")
-    return U @ Vt, poses[:, :, 3]
+    return R, poses[:, :, 3]
 
 
 def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
@@ -122,7 +123,8 @@ def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     first = 2 * stamps[0] - stamps[1]
     last = 2 * stamps[-1] - stamps[-2]
     known = np.array([first, *stamps, last]) - start
-    far = np.abs(t[:, None] - known[1:-1]).min(axis=1) > PACKET_DT / NANO
+    nearest = np.abs(t[:, None] - known[1:-1]).min(axis=1)
+    far = nearest > PACKET_DT / NANO
     far |= (t < known[0]) | (t > known[-1])
     if far.any():
         raise InputError(f"{path}: {far.sum()} of {len(t)} frames have no packet within {PACKET_DT:g} s")

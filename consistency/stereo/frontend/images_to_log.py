@@ -191,7 +191,7 @@ def write_frontend_log(
         plane = plane_of(motions, trial, belief)
         manifest["plane"] = plane.fields
         if plane.holds or options.planar:
-            view = rig.image_size, (float(rig.K_left[0, 2]), float(rig.K_left[1, 2]))
+            view = rig.image_size, rig.principal_point
             write_log(out, [trial], belief, None, manifest, overwrite, view, texts)
             return Summary(sequence, motions, plane, (trial, belief), path)
     write_tables(out, {}, manifest, lambda at: _write_texts(at, texts), overwrite)

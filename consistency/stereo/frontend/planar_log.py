@@ -148,7 +148,7 @@ def log_of(
         n_landmarks=int(seen["landmark"].max()) + 1,
         truth=true_path,
     )
-    sensor = BelievedSensor(model="uvd", sigma=sigma, f=float(rig.K_left[0, 0]), B=rig.baseline, mount=mount)
+    sensor = BelievedSensor(model="uvd", sigma=sigma, f=rig.f, B=rig.baseline, mount=mount)
     return trial, Belief(motion=odometry_noise(motions, axes, dt), sensor=sensor)
 
 
@@ -229,17 +229,15 @@ def misfit(
     ``path`` is (T + 1, 3). The misfit holds the noise of the pixels and what the plane leaves out, roll and pitch above
     all. No truth is used.
     """
-    f = float(rig.K_left[0, 0])
-    B = rig.baseline
     packed = mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
-    in_sensor = stereo.triangulate(*nearest[PIXELS].to_numpy(float).T, f, B)
+    in_sensor = stereo.triangulate(*nearest[PIXELS].to_numpy(float).T, rig.f, rig.baseline)
     in_robot = point.from_sensor(*in_sensor, packed)
     places = np.column_stack(point.to_world(*path[nearest["step"]].T, *in_robot))
     others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
     targets = places[nearest.index.get_indexer(others["landmark"])]
     in_robot = point.to_robot(*path[others["step"]].T, *targets.T)
-    expected = stereo.project(*point.to_sensor(*in_robot, packed), f, B)
+    expected = stereo.project(*point.to_sensor(*in_robot, packed), rig.f, rig.baseline)
     error = others[PIXELS].to_numpy(float) - np.column_stack(expected)
     u, v, d = np.sqrt(np.mean(error**2, axis=0)).tolist()
     return u, v, d
@@ -259,7 +257,8 @@ def odometry_noise(motions: list[RelativeMotion], axes: Array, dt: Array) -> Bel
         about = up @ angular(motion.pose)
         variances[k, 0] = forward @ motion.covariance[:3, :3] @ forward
         variances[k, 1] = about @ motion.covariance[3:, 3:] @ about
-    sigma_v, sigma_omega = np.sqrt(np.mean(variances / dt[:, None] ** 2, axis=0)).tolist()
+    of_velocities = variances / dt[:, None] ** 2
+    sigma_v, sigma_omega = np.sqrt(of_velocities.mean(axis=0)).tolist()
     return BelievedMotion(sigma_v=sigma_v, sigma_omega=sigma_omega)
 
 

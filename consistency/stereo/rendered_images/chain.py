@@ -122,7 +122,8 @@ def join_tracks(parts: Sequence[Tracks]) -> Tracks:
     numbered = []
     tracks = 0
     for k, part in enumerate(parts):
-        numbered.append(replace(part, sequence=np.full(len(part), k), track=part.track + tracks))
+        sequence = np.full(len(part), k)
+        numbered.append(replace(part, sequence=sequence, track=part.track + tracks))
         tracks += int(part.track.max(initial=-1)) + 1
     return _concatenated(numbered)
 

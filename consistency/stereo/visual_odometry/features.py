@@ -187,7 +187,8 @@ def stereo_matches(
         allowed = epipolar_gate(rig, left.uv[i], right.uv[j], tolerance)
         matches = mutual_matches(left.descriptors[i], right.descriptors[j], allowed, ratio)
         pairs = np.column_stack([i[matches[:, 0]], j[matches[:, 1]]])
-        groups.append(pairs[np.isin(pairs[:, 0], _within(left.uv[:, 1], low, high))])
+        of_band = _within(left.uv[:, 1], low, high)
+        groups.append(pairs[np.isin(pairs[:, 0], of_band)])
     pairs = np.concatenate(groups)
     return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
 

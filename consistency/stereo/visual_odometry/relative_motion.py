@@ -299,7 +299,8 @@ def _refined(
     used = inliers.copy()
     while True:
         try:
-            return refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy"), used
+            refined = refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy")
+            return refined, used
         except MatchError as error:
             if error.match is None or used.sum() <= FEWEST:
                 raise
@@ -325,7 +326,7 @@ def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
     The disparity itself counts as well: off the epipolar line least squares makes a near point of a small disparity.
     """
     good = triangulable(rig, uv)
-    furthest = rig.K_left[0, 0] * rig.baseline / min_disparity
+    furthest = rig.f * rig.baseline / min_disparity
     good[good] = triangulate(rig, uv[good])[:, 2] <= furthest
     good[good] = disparities(rig, uv[good]) >= min_disparity * (1.0 - ROUNDING)
     return good
@@ -342,4 +343,4 @@ def disparities(rig: StereoRig, uv: Array) -> Array:
     turn = np.stack([x, y, np.cross(x, y)])
     x_left, _, z_left = turn @ np.linalg.inv(rig.K_left) @ homogeneous(uv[:, :2]).T
     x_right, _, z_right = turn @ rig.R @ np.linalg.inv(rig.K_right) @ homogeneous(uv[:, 2:]).T
-    return rig.K_left[0, 0] * (x_left / z_left - x_right / z_right)
+    return rig.f * (x_left / z_left - x_right / z_right)

@@ -164,5 +164,5 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
 
 
 def cross_matrix(v: Array) -> Array:
-    """[v]x (3, 3), with [v]x w = v x w."""
+    """[v]x (..., 3, 3) of vectors (..., 3), with [v]x w = v x w."""
     return np.tensordot(v, AXES, 1)

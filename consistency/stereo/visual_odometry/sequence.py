@@ -133,18 +133,13 @@ def read_sequence(
         _require_no_gap(files[0])
         t = np.arange(len(files[0])) / (rate or RATE)
     size = read_image(files[0][0]).shape[::-1]
-    cameras = read_calibration(home, _camera_name(files[0]), _camera_name(files[1]), size)
+    folders = [side[0].parent for side in files]
+    if kind == "kitti-raw":  # whose images are one deeper, in ``data``
+        folders = [folder.parent for folder in folders]
+    cameras = read_calibration(home, folders[0].name, folders[1].name, size)
     with reading(cameras.source, "its cameras cannot be rectified"):
         rectification = rectify(cameras, size)
     return Sequence(folder, kind, *files, t, timed, cameras, rectification)
-
-
-def _camera_name(files: list[Path]) -> str:
-    """The name of the folder of a camera's images; KITTI raw has them one deeper, in ``data``."""
-    folder = files[0].parent
-    if folder.name == "data":
-        folder = folder.parent
-    return folder.name
 
 
 def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:

@@ -116,7 +116,8 @@ def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:
         up = refined(step * np.eye(RIG)[k])
         down = refined(-step * np.eye(RIG)[k])
         J[:3, k] = (up.t - down.t) / (2.0 * step)
-        J[3:, k] = Rotation.from_matrix(up.R @ down.R.T).as_rotvec() / (2.0 * step)
+        turn = Rotation.from_matrix(up.R @ down.R.T).as_rotvec()
+        J[3:, k] = turn / (2.0 * step)
     return J
 
 

@@ -30,7 +30,8 @@ class TwoFrames(NamedTuple):
         e1 = self.z1 - self.measure.value(pose.apply(q))
         e2 = self.z2 - self.measure.value(q)
         with np.errstate(invalid="ignore"):
-            s = np.einsum("ni,nij,nj->n", e1, self.W1, e1) + np.einsum("ni,nij,nj->n", e2, self.W2, e2)
+            s = np.einsum("ni,nij,nj->n", e1, self.W1, e1)
+            s += np.einsum("ni,nij,nj->n", e2, self.W2, e2)
         return np.where(np.isnan(s), np.inf, s)
 
 
@@ -71,7 +72,8 @@ def cost_derivatives(
     dd = AtH @ np.swapaxes(At, 1, 2)
     dq = AtH @ R
     if exact:
-        dd[:, 3:, 3:] += np.tensordot(f_a[:, :, None] * q[:, None], R_kl, ((1, 2), (2, 3)))
+        outer = f_a[:, :, None] * q[:, None]
+        dd[:, 3:, 3:] += np.tensordot(outer, R_kl, ((1, 2), (2, 3)))
         dq[:, 3:] += np.einsum("kij,ni->nkj", R_k, f_a)
     return Derivatives(
         d=np.einsum("nij,nj->ni", At, f_a),

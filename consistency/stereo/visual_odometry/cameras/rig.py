@@ -62,6 +62,17 @@ class StereoRig:
         """Distance of the two cameras, m."""
         return float(np.linalg.norm(self.t))
 
+    @property
+    def f(self) -> float:
+        """Focal length of the left camera along its rows, px."""
+        return float(self.K_left[0, 0])
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """That of the left camera, px."""
+        u, v = self.K_left[:2, 2].tolist()
+        return u, v
+
     @cached_property
     def cameras(self) -> Array:
         """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""

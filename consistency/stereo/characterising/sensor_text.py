@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,7 +17,7 @@ from consistency.bench.store.log import sensor_keys
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import p_text
-from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Text, table
+from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
@@ -25,7 +25,7 @@ from consistency.stereo.characterising.bias_map import BiasEstimate
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
-HEADS = ("noise px", "correlation", "offset share", "1/nu", "kurtosis", "pooled px")
+HEADS = ("", "noise px", "correlation", "offset share", "1/nu", "kurtosis", "pooled px")
 
 
 def interval(estimate: Interval, digits: int = 4, factor: float = 1.0) -> str:
@@ -138,15 +138,20 @@ def counted(of: Characterisation) -> str:
 
 def sensor_blocks(of: Characterisation) -> tuple[Block, ...]:
     """One row a coordinate, then a sentence for each answer."""
+    return Text(counted(of)), estimates_table(of, HEADS, 4), *map(Text, sentences(of))
+
+
+def estimates_table(of: Characterisation, heads: Sequence[str], digits: int, caption: str = "") -> Table:
+    """One row a coordinate; ``digits`` of its noise."""
     rows: list[tuple[Cell, ...]] = []
     for c in of.coordinates:
-        kurtosis = f"{c.tails.excess_kurtosis:.2f}"
         shares = map(_or_dash, (c.correlation, c.offset, c.tails.weight))
-        rows.append((c.name, interval(c.sigma), *shares, kurtosis, Quantity(c.pooled, digits=".4g")))
-    columns = [Column("")]
-    for head in HEADS:
+        pooled = Quantity(c.pooled, digits=f".{digits}g")
+        rows.append((c.name, interval(c.sigma, digits), *shares, f"{c.tails.excess_kurtosis:.2f}", pooled))
+    columns = [Column(heads[0])]
+    for head in heads[1:]:
         columns.append(Column(head, number=True))
-    return Text(counted(of)), table(tuple(columns), rows, "Estimates of the sensor"), *map(Text, sentences(of))
+    return table(tuple(columns), rows, "Estimates of the sensor", caption=caption)
 
 
 def _or_dash(estimate: Interval | None) -> Cell:

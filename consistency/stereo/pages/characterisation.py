@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
+from consistency.referee.document.blocks import Chapter, Document, Facts, Figure, Text
 from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
 from consistency.referee.pages.origin import facts
 from consistency.referee.show.painting import add_legend, band, canvas, dots, log_axis, stroke
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
-from consistency.stereo.characterising.sensor_text import counted, interval, sentences
+from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +25,7 @@ MEASURED = Look(COLOURS[0])
 NORMAL = Look("#333333")
 STUDENT = Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)
-HEADS = ("Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
+HEADS = ("Coordinate", "Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
 REACH = 5.0  # standard deviations of the distribution that are drawn
 BINS = 60
 LOCALLY = 20  # groups of equal size in which a standard deviation is drawn
@@ -34,8 +33,10 @@ LOCALLY = 20  # groups of equal size in which a standard deviation is drawn
 
 def compose_sensor(of: Characterisation, manifest: Mapping[str, Any]) -> Document:
     """The document that HTML and PDF show."""
+    caption = f"Intervals hold together with {100 * (1 - of.level.rate):g} %; 1/nu is 0 for a Gaussian noise."
+    estimates = estimates_table(of, HEADS, 3, caption)
     chapters = [
-        Chapter("estimates", "Estimates", "Estimates", (_estimates(of), *(Text(s) for s in sentences(of)))),
+        Chapter("estimates", "Estimates", "Estimates", (estimates, *map(Text, sentences(of)))),
         Chapter("disparity", "Noise over disparity", "Disparity", (_over_disparity(of),)),
     ]
     if of.bias is not None and of.bias.grid.known.any():
@@ -45,25 +46,6 @@ def compose_sensor(of: Characterisation, manifest: Mapping[str, Any]) -> Documen
         Chapter("provenance", "Provenance", "Provenance", (Facts(tuple(facts(dict(manifest)))),)),
     ]
     return Document(f"Sensor: {of.source}", counted(of) + ".", tuple(chapters))
-
-
-def _estimates(of: Characterisation) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for c in of.coordinates:
-        shares = map(_or_dash, (c.correlation, c.offset, c.tails.weight))
-        pooled = "–"
-        if np.isfinite(c.pooled):
-            pooled = f"{c.pooled:.3g}"
-        rows.append((c.name, interval(c.sigma, 3), *shares, f"{c.tails.excess_kurtosis:.2f}", pooled))
-    caption = f"Intervals hold together with {100 * (1 - of.level.rate):g} %; 1/nu is 0 for a Gaussian noise."
-    columns = [Column("Coordinate"), *(Column(head, number=True) for head in HEADS)]
-    return table(tuple(columns), rows, "Estimates of the sensor", caption=caption)
-
-
-def _or_dash(estimate: Interval | None) -> str:
-    if estimate is None:
-        return "–"
-    return interval(estimate, 2)
 
 
 # --- figures ----------------------------------------------------------------------------------------

@@ -15,12 +15,12 @@ from consistency.bench.store.log import Log, SensorFile, read_log, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
-from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
 from consistency.stereo.characterising.fitted_tracks import characterise_posed
 from consistency.stereo.characterising.point_fit import SHORTEST, Sightings
 from consistency.stereo.characterising.truth_residuals import moved_before, residuals_of
+from consistency.stereo.frontend.camera_truth import tum_poses
 from consistency.stereo.frontend.planar_log import CAMERA
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
@@ -156,11 +156,10 @@ def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None
 
 def _in_space(trial: Trial, path: Path) -> Sightings:
     """What is seen from the true poses of the left camera in a file of TUM's form, a line for each of steps 0..T."""
-    lines = read_trajectory(path, true=True)
-    if len(lines.values) != trial.steps + 1:
-        raise InputError(f"{path}: {len(lines.values)} poses for steps 0 to {trial.steps}; must hold one for each")
-    R = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA
-    t = lines.values[:, 1:4]
+    _, R, t = tum_poses(path)
+    if len(t) != trial.steps + 1:
+        raise InputError(f"{path}: {len(t)} poses for steps 0 to {trial.steps}; must hold one for each")
+    R = R @ CAMERA
     order = np.lexsort((trial.step, trial.landmark))
     step = trial.step[order]
     moving = np.ones(len(step), bool)

@@ -89,10 +89,17 @@ def _columns(path: Path) -> int:
     return 0
 
 
-def _tum(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+def tum_poses(path: Path) -> tuple[Array, Array, Array]:
+    """Times (n,), s, rotations (n, 3, 3) and positions (n, 3), m, of a file of TUM's form."""
     lines = read_trajectory(path, true=True)
-    poses = lines.values[_matched(path, sequence.t, lines.t)]
-    return Rotation.from_quat(poses[:, 4:8]).as_matrix(), poses[:, 1:4]
+    R = Rotation.from_quat(lines.values[:, 4:8]).as_matrix()
+    return lines.t, R, lines.values[:, 1:4]
+
+
+def _tum(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+    stamps, R, t = tum_poses(path)
+    own = _matched(path, sequence.t, stamps)
+    return R[own], t[own]
 
 
 def _kitti(path: Path, frames: int) -> tuple[Array, Array]:

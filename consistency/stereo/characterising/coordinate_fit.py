@@ -62,9 +62,9 @@ def interval_on_scale(scale: Callable[[float], float], middle: float, half: floa
 
 def half_width(gradient: Array, fit: LikelihoodFit, level: float) -> float:
     """Half of an interval of ``gradient' theta``."""
-    gaussian = np.sqrt(max(gradient @ fit.cov @ gradient, 0.0))
-    any_noise = np.sqrt(max(gradient @ fit.robust @ gradient, 0.0))
-    return wider(gaussian, any_noise, fit.tracks, level)
+    gaussian = np.sqrt(np.maximum(gradient @ fit.cov @ gradient, 0.0))
+    any_noise = np.sqrt(np.maximum(gradient @ fit.robust @ gradient, 0.0))
+    return float(wider(gaussian, any_noise, fit.tracks, level))
 
 
 def parameter_half_width(k: int, fit: LikelihoodFit, level: float) -> float:
@@ -195,8 +195,8 @@ def tails(w: Array, level: float) -> ResidualTails:
         return 2.0 * optimize.minimize_scalar(negative, bounds=(-1.5, 0.5), method="bounded").fun
 
     best = optimize.minimize_scalar(deviance, bounds=(0.0, HEAVIEST), method="bounded", options={"xatol": 1e-5})
-    value = best.x
-    least = best.fun
+    value = float(best.x)
+    least = float(best.fun)
     if deviance(0.0) <= least:
         value = 0.0
         least = deviance(0.0)

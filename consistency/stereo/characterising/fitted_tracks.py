@@ -144,10 +144,10 @@ def log_interval(of: PointFit, chosen: Array, sigma: float, level: float) -> tup
     dof = of.free[chosen].sum()
     excess = np.where(chosen, of.r**2 - sigma**2 * of.free, 0.0).sum(axis=1)
     of_tracks = of.sums_of_tracks(excess)
-    tracks = np.count_nonzero(of.sums_of_tracks(chosen.any(axis=1)))
+    tracks = int(np.count_nonzero(of.sums_of_tracks(chosen.sum(axis=1))))
     gaussian = np.sqrt(0.5 / dof)
     any_noise = 0.5 * np.sqrt((of_tracks**2).sum()) / (dof * sigma**2)
-    half = wider(gaussian, any_noise, tracks, level)
+    half = float(wider(gaussian, any_noise, tracks, level))
     interval = interval_on_scale(lambda log: sigma * np.exp(log), 0.0, half)
     return interval, max(gaussian, any_noise) ** 2
 

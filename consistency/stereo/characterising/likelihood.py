@@ -144,8 +144,8 @@ class Likelihood(NamedTuple):
         nodes = self.rows.G.shape[1]
         if not self.memory:
             return Parameters(np.exp(x), 0.0, 0.0)
-        rho = np.tanh(x[nodes])
-        ratio = np.expm1(x[nodes + 1]) / max(self.rows.length, 1.0)
+        rho = float(np.tanh(x[nodes]))
+        ratio = float(np.expm1(x[nodes + 1])) / max(self.rows.length, 1.0)
         return Parameters(np.exp(x[:nodes]), rho, ratio)
 
     def restricted(self, x: Array) -> float:
@@ -188,9 +188,13 @@ def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     x = np.zeros(nodes + 2 * memory)
     x[:nodes] = np.log(start)
     normal = rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9)
-    about_plain = rows.r - rows.X @ np.linalg.solve(normal, rows.X.T @ rows.r)
+    about_plain = (rows.r - rows.X @ np.linalg.solve(normal, rows.X.T @ rows.r))[:, None]
+
+    def with_plain_bias(values: Array) -> float:
+        return likelihood.with_bias_held(values, about_plain)
+
     options = {"gtol": GENTLE * len(rows.r)}
-    first = optimize.minimize(likelihood.with_bias_held, x, (about_plain[:, None],), method="BFGS", options=options)
+    first = optimize.minimize(with_plain_bias, x, method="BFGS", options=options)
     x, H = _climb(likelihood, first.x)
     regression = regress(rows, likelihood.parameters(x))
     if regression is None:

@@ -165,7 +165,7 @@ def observations(rig: StereoRig, motions: list[RelativeMotion]) -> pd.DataFrame:
         before = _sights(rig, motion.uv0[good], motion.sigma0[good], piece, step - 1)
         after = _sights(rig, motion.uv1[good], motion.sigma1[good], piece, step)
         new = piece >= tracks  # tracks are numbered in the order in which they begin
-        tracks += np.count_nonzero(new)
+        tracks += int(new.sum())
         parts += [before[new], after]
     return pd.concat(parts).sort_values(["piece", "step"], ignore_index=True)
 
@@ -231,9 +231,11 @@ def misfit(
     """
     packed = mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
-    in_sensor = stereo.triangulate(*nearest[PIXELS].to_numpy(float).T, rig.f, rig.baseline)
+    u, v, d = nearest[PIXELS].to_numpy(float).T
+    in_sensor = stereo.triangulate(u, v, d, rig.f, rig.baseline)
     in_robot = point.from_sensor(*in_sensor, packed)
-    places = np.column_stack(point.to_world(*path[nearest["step"]].T, *in_robot))
+    x, y, heading = path[nearest["step"]].T
+    places = np.column_stack(point.to_world(x, y, heading, *in_robot))
     others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
     targets = places[nearest.index.get_indexer(others["landmark"])]
     in_robot = point.to_robot(*path[others["step"]].T, *targets.T)

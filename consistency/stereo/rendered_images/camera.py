@@ -153,4 +153,4 @@ class StereoCamera:
     def inside(self, uv: Array, margin: float = 0.0) -> Array:
         """Whether places (N, 2) px from the middle are in the image and ``margin`` px clear of its border."""
         half = np.array(self.size) / 2.0 - margin
-        return (np.abs(uv) <= half).all(axis=-1)
+        return np.asarray((np.abs(uv) <= half).all(axis=-1))

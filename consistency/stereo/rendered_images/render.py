@@ -86,7 +86,7 @@ def _box(
     near = _near(layer, reach, a, b, margin).reshape(coarse.shape[:2])
     if not near.any():
         return None
-    return _extent(near.any(axis=1)), _extent(near.any(axis=0))
+    return _extent(near.sum(axis=1)), _extent(near.sum(axis=0))
 
 
 def _extent(near: Array) -> slice:

@@ -161,7 +161,8 @@ def _error_and_slope(
 def _points(z: Array, sensor: BelievedSensor) -> Array:
     """Observations (n, s) as points in the robot frame (n, 3), m; those of a sensor in the plane have height 0."""
     if sensor.model == "uvd":
-        at = stereo.triangulate(*z.T, *sensor.rig)
+        u, v, d = z.T
+        at = stereo.triangulate(u, v, d, *sensor.rig)
     elif sensor.model == "range-bearing":
         at = *planar.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
     else:
@@ -172,7 +173,8 @@ def _points(z: Array, sensor: BelievedSensor) -> Array:
 def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
     """Observations (n, s) of points (n, 3) in the robot frame, and their derivative (n, s, 3)."""
     mount = sensor.mount.packed()
-    x, y, z = point.to_sensor(*points.T, mount)
+    bx, by, bz = points.T
+    x, y, z = point.to_sensor(bx, by, bz, mount)
     if sensor.model == "uvd":
         x = np.maximum(x, NEAREST)
         seen = np.column_stack(stereo.project(x, y, z, *sensor.rig))
@@ -256,9 +258,7 @@ def screened_log(log: Log, gate: str | Array) -> Log:
     InputError
         ``gate`` is not one positive number for each value; the sensor is linear.
     """
-    values = gate
-    if isinstance(gate, str):
-        values = _numbers(gate)
+    values = _numbers(gate)
     size = log.belief.sensor.size
     if values.shape != (size,) or not (np.isfinite(values) & (values > 0)).all():
         example = ",".join(["2", "2", "1"][:size])
@@ -293,8 +293,10 @@ def screening_line(log: Log) -> str:
     )
 
 
-def _numbers(text: str) -> Array:
+def _numbers(gate: str | Array) -> Array:
+    if not isinstance(gate, str):
+        return gate
     try:
-        return np.array(text.split(","), float)
+        return np.array(gate.split(","), float)
     except ValueError:
         return np.zeros(0)

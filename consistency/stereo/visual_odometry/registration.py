@@ -46,7 +46,7 @@ def register_svd(p1: Array, p2: Array) -> RelativePose:
     """
     p1, p2 = checked_clouds(p1, p2)
     R, t, fixed = rigid_motions(p1, p2)
-    _require_unique(fixed)
+    _require_unique(float(fixed))
     return RelativePose(R, t)
 
 

@@ -19,8 +19,9 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
 from consistency.stereo.visual_odometry.odometry import neighbours
-from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, cross_matrix
+from consistency.stereo.visual_odometry.resection import diagonal_covariances
 
 # What is shared, and the standard deviation of its prior
 SHARED = {

@@ -78,7 +78,7 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
         taken = landmark[at] != FREE
         crowd = np.bincount(band[at[taken]], minlength=rule.bands)
         candidates = at[~taken & (left[at] >= rule.min_life)]
-        for row in _next_rows(candidates, band, crowd, rule.slots - np.count_nonzero(taken)):
+        for row in _next_rows(candidates, band, crowd, rule.slots - taken.sum()):
             life = left[row]
             if life > rule.max_age:
                 life = rule.max_age

@@ -106,7 +106,7 @@ def symmetric_inverses(C: Array) -> tuple[Array, Array]:
     """
     if C.shape[-1] != 3:
         one = np.eye(C.shape[-1])
-        finite = np.isfinite(C).all(axis=(-2, -1))
+        finite = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
         least = np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0]
         definite = finite & (least > 0.0)
         return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite

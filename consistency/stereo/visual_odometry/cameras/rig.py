@@ -109,7 +109,7 @@ class StereoRig:
     def inside(self, uv: Array) -> Array:
         """(N, 4) px to (N,) bool: seen in both images."""
         largest = np.tile(self.image_size, 2) - 1.0
-        return ((uv >= 0.0) & (uv <= largest)).all(axis=1)
+        return np.asarray(((uv >= 0.0) & (uv <= largest)).all(axis=1))
 
 
 def triangulate(rig: StereoRig, uv: Array) -> Array:

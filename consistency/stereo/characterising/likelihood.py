@@ -185,16 +185,18 @@ def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     """
     likelihood = Likelihood(rows, memory)
     nodes = rows.G.shape[1]
-    x = np.zeros(nodes + 2 * memory)
-    x[:nodes] = np.log(start)
+    x = np.full(nodes, np.log(start))
+    if memory:
+        x = np.append(x, [0.0, 0.0])
     normal = rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9)
     about_plain = (rows.r - rows.X @ np.linalg.solve(normal, rows.X.T @ rows.r))[:, None]
-
-    def with_plain_bias(values: Array) -> float:
-        return likelihood.with_bias_held(values, about_plain)
-
-    options = {"gtol": GENTLE * len(rows.r)}
-    first = optimize.minimize(with_plain_bias, x, method="BFGS", options=options)
+    first = optimize.minimize(
+        likelihood.with_bias_held,
+        x,
+        args=(about_plain,),
+        method="BFGS",
+        options={"gtol": GENTLE * len(rows.r)},
+    )
     x, H = _climb(likelihood, first.x)
     regression = regress(rows, likelihood.parameters(x))
     if regression is None:

@@ -8,8 +8,7 @@ from consistency.referee.extras import explained_import
 with explained_import(__name__):
     from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
     from consistency.stereo.rendered_images.chain import Chain, Tracks
-    from consistency.stereo.rendered_images.stops import Stops, stand
-    from consistency.stereo.rendered_images.track_errors import (
+    from consistency.stereo.rendered_images.sensor_tables import (
         Biases,
         Growth,
         TrackMeans,
@@ -17,6 +16,7 @@ with explained_import(__name__):
         disparity_growth,
         track_means,
     )
+    from consistency.stereo.rendered_images.stops import Stops, stand
 
 __all__ = [
     "Biases",

@@ -18,9 +18,9 @@ from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
+from consistency.stereo.rendered_images.sensor_tables import track_means
 from consistency.stereo.rendered_images.stages import LeftRightCheck
 from consistency.stereo.rendered_images.stops import Stops, stand
-from consistency.stereo.rendered_images.track_errors import track_means
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 drives = sibling(__file__, "image_drives")

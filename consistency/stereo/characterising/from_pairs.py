@@ -19,7 +19,7 @@ from consistency.stereo.frontend.planar_log import CAMERA, observations
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
-from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence
 from consistency.stereo.visual_odometry.tracks import PIXELS
 
 CHOSEN = (
@@ -55,7 +55,7 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
     return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), tuple(notes), free)
 
 
-def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
+def _poses(sequence: StereoSequence, options: SourceOptions) -> tuple[Array, Array]:
     """Poses (n, 3, 3), (n, 3) of the left camera; equal poses at rest."""
     if options.at_rest:
         n = len(sequence)

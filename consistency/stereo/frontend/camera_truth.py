@@ -16,7 +16,7 @@ from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.camera_pair import CAMERA_0, EUROC_BODY
-from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, Sequence, read_number_table
+from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, StereoSequence, read_number_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`
 PACKET_DT = 0.11  # s between an image of KITTI raw and a packet: one period, of 9.6 Hz
@@ -25,7 +25,7 @@ NO_TABLE = "not a table of finite numbers"
 ROTATION = 1e-3  # largest entry of R'R - I; KITTI writes seven digits
 
 
-def find_truth(sequence: Sequence) -> Path | None:
+def find_truth(sequence: StereoSequence) -> Path | None:
     """Where the layout keeps the truth, or None; the folder itself of a drive of KITTI raw with its calibrations."""
     if is_raw_drive(sequence):
         if missing_of_drive(sequence):
@@ -37,12 +37,12 @@ def find_truth(sequence: Sequence) -> Path | None:
     return None
 
 
-def is_raw_drive(sequence: Sequence) -> bool:
+def is_raw_drive(sequence: StereoSequence) -> bool:
     """Whether the images are those of a drive of KITTI raw that has packets of its inertial unit."""
     return sequence.format == "kitti-raw" and is_drive(sequence.folder)
 
 
-def missing_of_drive(sequence: Sequence) -> list[str]:
+def missing_of_drive(sequence: StereoSequence) -> list[str]:
     """What oxts of a drive of KITTI raw lacks to be the truth of the camera; empty for other layouts."""
     if not is_raw_drive(sequence):
         return []
@@ -53,7 +53,7 @@ def missing_of_drive(sequence: Sequence) -> list[str]:
     return lacking
 
 
-def read_truth(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+def read_truth(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
     """Poses of the rectified left camera in the world at every frame, (n, 3, 3) and (n, 3) in m.
 
     12 numbers a line are KITTI's (3 x 4 row by row, a line a frame); a .csv is EuRoC's (nanoseconds, position,
@@ -96,7 +96,7 @@ def tum_poses(path: Path) -> tuple[Array, Array, Array]:
     return lines.t, R, lines.values[:, 1:4]
 
 
-def _tum(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+def _tum(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
     stamps, R, t = tum_poses(path)
     own = _matched(path, sequence.t, stamps)
     return R[own], t[own]
@@ -114,7 +114,7 @@ def _kitti(path: Path, frames: int) -> tuple[Array, Array]:
     return R, poses[:, :, 3]
 
 
-def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+def _drive(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
     if sequence.format != "kitti-raw" or sequence.calibration.body != CAMERA_0:
         raise InputError(f"--truth {path}: is of a drive of KITTI raw with {RAW_CALIBRATION}; the images are not")
     stamps, poses = drive_poses(path, "camera")
@@ -142,7 +142,7 @@ def _drive(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     return _of_camera(turn, place, sequence)
 
 
-def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
+def _euroc(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
     rows = read_number_table(path, ",", NO_TABLE)
     if rows.shape[1] < 8 or not np.isfinite(rows[:, :8]).all() or (np.diff(rows[:, 0]) <= 0).any():
         raise InputError(f"{path}: must hold increasing nanoseconds, position and quaternion w x y z, all finite")
@@ -156,7 +156,7 @@ def _euroc(path: Path, sequence: Sequence) -> tuple[Array, Array]:
     return _of_camera(turn, rows[:, 1:4], sequence)
 
 
-def _of_camera(turn: Array, place: Array, sequence: Sequence) -> tuple[Array, Array]:
+def _of_camera(turn: Array, place: Array, sequence: StereoSequence) -> tuple[Array, Array]:
     """Poses of the left camera from those of the body that its calibration ties it to."""
     body = sequence.calibration.body_from_left
     assert body is not None

@@ -27,7 +27,7 @@ from consistency.stereo.frontend.planar_log import MIN_LIFE, Plane, log_of, plan
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.odometry import motion_covariances, trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
-from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence
 
 LANDMARKS = 200  # in a log; the filters' covariance is then 603 x 603
 FEWEST = MIN_LIFE + 1  # stereo pairs of a log: the first is not an observation
@@ -54,7 +54,7 @@ class FrontendOptions:
 class Summary(NamedTuple):
     """A built log, and what it is of."""
 
-    sequence: Sequence
+    sequence: StereoSequence
     motions: list[RelativeMotion]
     plane: Plane | None  # None of fewer pairs than a log takes
     log: tuple[Trial, Belief] | None  # None of fewer pairs than a log takes, and where the motions leave the plane
@@ -204,7 +204,7 @@ def _write_texts(folder: Path, files: dict[str, str]) -> None:
 
 
 def trajectory_texts(
-    sequence: Sequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
+    sequence: StereoSequence, motions: list[RelativeMotion], truth: tuple[Array, Array] | None
 ) -> dict[str, str]:
     """Texts of trajectory.tum, covariance.txt and truth.tum, all in the first camera's frame, and of motions.tum.
 

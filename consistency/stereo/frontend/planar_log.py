@@ -20,7 +20,7 @@ from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import angular, euler_angles
-from consistency.stereo.visual_odometry.sequence import Sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence
 from consistency.stereo.visual_odometry.tracks import PIXELS, TrackSelection, linked, thinned
 
 MAX_AGE = 12  # observations of a landmark, at most, as docs/reference/recorded.md
@@ -105,7 +105,7 @@ def stacked(motions: list[RelativeMotion]) -> tuple[Array, Array]:
 
 
 def log_of(
-    sequence: Sequence,
+    sequence: StereoSequence,
     motions: list[RelativeMotion],
     truth: tuple[Array, Array] | None,
     max_landmarks: int,

@@ -5,7 +5,7 @@ Motions that the images do not tell are bridged from the motions around them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from consistency.stereo.visual_odometry.relative_motion import (
     stereo_features,
 )
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular, cross_matrix
-from consistency.stereo.visual_odometry.sequence import Sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence
 
 FULL, FEWEST = 12, 3  # motions beside which a bridge was tried, for a covariance (6, 6), and for variances alone
 MOST = 0.5  # of the motions may be missing
 
 
 def visual_odometry(
-    sequence: Sequence, *, rng: np.random.Generator, settings: MotionSettings | None = None
+    sequence: StereoSequence, *, rng: np.random.Generator, settings: MotionSettings | None = None
 ) -> list[RelativeMotion]:
     """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
 
@@ -58,7 +58,7 @@ def visual_odometry(
     return bridged(motions, sequence.t)
 
 
-def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
+def trajectory(motions: Sequence[RelativeMotion]) -> tuple[Array, Array, Array]:
     """Poses of the left camera in its first frame, and covariances to first order.
 
     The errors of the motions are taken as independent. Two in a row share the pixels of a frame, with opposite signs:
@@ -91,7 +91,7 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
     return np.array(R), np.array(t), np.array(P)
 
 
-def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
+def motion_covariances(motions: Sequence[RelativeMotion]) -> Array:
     """Covariances (T, 6, 6) of the motions, of position and rotation vector in the frame that each begins in.
 
     Error convention so3 of ``consistency.referee.geometry.conventions``, m and rad.
@@ -102,7 +102,7 @@ def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
     return propagated(G, np.array([motion.covariance for motion in motions]))
 
 
-def bridged(found: Ordered[RelativeMotion | InputError], t: Array) -> list[RelativeMotion]:
+def bridged(found: Sequence[RelativeMotion | InputError], t: Array) -> list[RelativeMotion]:
     """All motions of a sequence, where those that could not be measured keep to their neighbours' velocity.
 
     Between two measured motions the six numbers of the pose are interpolated, before the first and after the last one

@@ -29,7 +29,7 @@ FEWEST = 2  # stereo pairs
 
 
 @dataclass(frozen=True)
-class Sequence:
+class StereoSequence:
     """Stereo pairs in the order of time; images are read when they are asked for."""
 
     folder: Path
@@ -76,7 +76,7 @@ def read_sequence(
     left: str | None = None,
     right: str | None = None,
     rate: float | None = None,
-) -> Sequence:
+) -> StereoSequence:
     """The stereo pairs of a folder and their calibration.
 
     Parameters
@@ -139,7 +139,7 @@ def read_sequence(
     cameras = read_calibration(home, folders[0].name, folders[1].name, size)
     with reading(cameras.source, "its cameras cannot be rectified"):
         rectification = rectify(cameras, size)
-    return Sequence(folder, kind, *files, t, timed, cameras, rectification)
+    return StereoSequence(folder, kind, *files, t, timed, cameras, rectification)
 
 
 def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:

@@ -16,7 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.system.shipped import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.registration import rigid_motions
-from consistency.stereo.visual_odometry.sequence import read_sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence
 from consistency.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 
 rigs = sibling(str(data_folder("experiments") / "README.md"), "published_rig")

@@ -12,6 +12,7 @@ from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovatio
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
+    SIDE,
     is_uncertain,
     off_by,
     off_by_factor,
@@ -19,7 +20,7 @@ from consistency.referee.diagnostics.words.numbers import (
     ratio_text,
     short,
 )
-from consistency.referee.diagnostics.words.unlike_factors import block_text, unlike_ratios, unlike_text
+from consistency.referee.diagnostics.words.unlike_factors import factors_text, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 NAMED = 0.1  # part of a unit vector that a sentence names
@@ -53,29 +54,29 @@ def scale_text(v: Findings) -> str:
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = _size_text(v, inflation, about)
-    blocks = ""
+    size, note = _size_and_note(v, inflation)
+    text = f"covariance{about} {size}{_since(v)}"
+    factors = ""
     if not about:
-        blocks = block_text(v)
-    if blocks:
-        return f"{text}{_first_visible(v)}: {blocks}"
+        factors = factors_text(v)
+    if factors:
+        return f"{text}{_first_visible(v)}{note}; {factors}"
     text += _where(v) + _first_visible(v)
     if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
         text += _contrary_axis(v)
-    return text
+    return text + note
 
 
-def _size_text(v: Findings, inflation: Interval, about: str) -> str:
-    """The size of the fault, and since when."""
+def _size_and_note(v: Findings, inflation: Interval) -> tuple[str, str]:
+    """The size of the fault, and what is to be known of runs that differ much."""
+    size = off_by(inflation)
     if v.runs > 1 and inflation.value > TINY and is_uncertain(inflation):
-        off = off_by_factor(inflation.value)
-        if inflation.low > 1.0:
-            off = off_by(inflation)
-        return f"covariance{about} {off}{_since(v)} in the mean, which a few {v.unit}s make"
-    text = f"covariance{about} {off_by(inflation)}"
-    if inflation.holds(1.0) and v.runs > 1:
-        return f"{text}{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
-    return f"{text}{_since(v)}"
+        if inflation.low <= 1.0:
+            size = off_by_factor(inflation.value)
+        return f"{size} in the mean", f"; a few {v.unit}s make up that mean"
+    if v.runs > 1 and inflation.holds(1.0):
+        return size, f"; the interval holds 1 because the {v.unit}s differ more than Gaussian errors would"
+    return size, ""
 
 
 def _where(v: Findings) -> str:
@@ -238,7 +239,7 @@ def bias_text(v: Findings, in_steps: bool) -> str:
     if in_steps:
         size = ""
         if v.bias.size is not None:
-            size = f" {_sigmas(v.bias.size)} sigma in {v.bias.axis},"
+            size = f" {_sigmas(v.bias.size)} sigma in {v.bias.axis}"
         return f"mean error{size} in {v.place(v.bias.step or 1)}{rest}"
     sure = [(axis, interval) for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)]
     sure.sort(key=lambda item: -abs(item[1].value))
@@ -265,6 +266,7 @@ def shape_text(v: Findings, scale: str = "") -> str:
     assert v.shape is not None
     assert v.axes is not None
     shape = v.shape
+    wrong = "covariance of the wrong shape"
     where = ""
     worth_a_word = VISIBLE
     if "shape" not in v.faults:
@@ -273,32 +275,30 @@ def shape_text(v: Findings, scale: str = "") -> str:
     gap = abs(shape.actual - shape.stated)
     if shape.shown and shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
-        what = "covariance of the wrong shape: correlation"
+        what = f"{wrong}: correlation"
         if shape.wrong_sign:
             what = "correlation of the wrong sign:"
         text = f"{what} {shape.actual:+.2f}, stated {shape.stated:+.2f}, of {a} and {b}{where}"
         if shape.alone:
             text += "; no axis by itself is wrong"
         return text
-    if shape.alone:
-        return f"covariance of the wrong shape{where}; no axis by itself is wrong"
     off = list(unlike_ratios(v).values())[:MOST]
     if not off:
-        return f"covariance of the wrong shape{where}"
-    if all(off_by(ratio) in scale for ratio in off):
+        return f"{wrong}{where}"
+    if all(off_by(ratio)[SIDE:] in scale for ratio in off):
         return ""
-    return f"unlike factors: {unlike_text(v)}"
+    return f"{wrong}: {unlike_text(v)}"
 
 
 def tails_text(v: Findings) -> str:
     """The error that stands out, or that runs differ more than they should."""
     if "outliers" not in v.faults:
-        return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
+        return f"the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
     where = v.run_name(v.tails.run)
     if v.steps > 1:
         where += f", {v.place(v.tails.step)}"
-    return f"heavy tails: {short(v.tails.distance)} sigma from the other {v.unit}s in {where}"
+    return f"outlier in {where}: {short(v.tails.distance)} sigma from the other {v.unit}s"
 
 
 def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
@@ -20,13 +18,10 @@ from consistency.referee.diagnostics.words.numbers import (
     ratio_text,
     short,
 )
-from consistency.referee.diagnostics.words.unlike_factors import factors_text, unlike_ratios, unlike_text
+from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 NAMED = 0.1  # part of a unit vector that a sentence names
-
-NamedRatio = tuple[str, Interval]
-
 
 # --- the scale ---------------------------------------------------------------------------------------
 
@@ -61,10 +56,7 @@ def scale_text(v: Findings) -> str:
         factors = factors_text(v)
     if factors:
         return f"{text}{_first_visible(v)}{note}; {factors}"
-    text += _where(v) + _first_visible(v)
-    if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
-        text += _contrary_axis(v)
-    return text + note
+    return f"{text}{_where(v)}{_first_visible(v)}{note}"
 
 
 def _size_and_note(v: Findings, inflation: Interval) -> tuple[str, str]:
@@ -108,14 +100,6 @@ def _first_visible(v: Findings) -> str:
     if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
         return ""
     return f", first visible in {v.place(where.first_step)}"
-
-
-def _contrary_axis(v: Findings) -> str:
-    """The component farthest in the other direction."""
-    for axis, interval in _wrong(v, -1).items():
-        if v.axes is not None and axis in v.axes.names:
-            return f", but {off_by(interval)} in {axis}"
-    return ""
 
 
 def _since(v: Findings) -> str:
@@ -187,21 +171,17 @@ def _axes_text(v: Findings) -> str:
     side = SIDES.get(v.status, 0)
     if v.settings.one_sided:
         side = 1
-    above: list[NamedRatio] = []
-    below: list[NamedRatio] = []
+    off: dict[str, Interval] = {}
     if side != -1:
-        above = list(_wrong(v, 1).items())
+        off |= _wrong(v, 1)
     if side != 1:
-        below = list(_wrong(v, -1).items())
+        off |= _wrong(v, -1)
     largest = v.axes.largest
-    if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for _, i in above):
+    if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in off.values()):
         return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
-    named = (above + below)[:MOST]
-    if above and below:
-        named = [*above[: MOST - 1], below[0]]
-    if not named:
+    if not off:
         return "covariance wrong in an axis"
-    return f"covariance {_sizes_in_axes(named)}{_since(v)}"
+    return f"covariance {_sizes_in_axes(off)}{_since(v)}"
 
 
 def _direction_text(v: Findings) -> str:
@@ -213,14 +193,14 @@ def _direction_text(v: Findings) -> str:
     return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED)
 
 
-def _sizes_in_axes(named: Iterable[NamedRatio]) -> str:
-    return ", ".join(f"{off_by(interval)} in {axis}" for axis, interval in named)
+def _sizes_in_axes(off: dict[str, Interval]) -> str:
+    return ", ".join(f"{off_by(off[axis])} in {axis}" for axis in names_to_say(off))
 
 
 def _correlation_text(v: Findings) -> str:
     """Axes that are too large, and a direction in which the correlation makes the covariance too small."""
     assert v.scale is not None
-    text = f"covariance {_sizes_in_axes(list(_wrong(v, -1).items())[:MOST])}"
+    text = f"covariance {_sizes_in_axes(_wrong(v, -1))}"
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof

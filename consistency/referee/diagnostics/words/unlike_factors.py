@@ -62,7 +62,7 @@ def unlike_text(v: Findings) -> str:
     assert v.axes is not None
     texts = []
     side = ""
-    for name in _named(off):
+    for name in names_to_say(off):
         size = off_by(off[name])
         texts.append(f"{name} {size.removeprefix(side).lstrip()}")  # the side once: x too small by ..., y by ...
         side = size[:SIDE]
@@ -76,7 +76,7 @@ def unlike_text(v: Findings) -> str:
     return ", ".join(texts)
 
 
-def _named(off: dict[str, Interval]) -> list[str]:
+def names_to_say(off: dict[str, Interval]) -> list[str]:
     """The first of those that are off, with one of either side."""
     names = list(off)[:MOST]
     contrary = [name for name in off if (off[name].value > 1.0) != (off[names[0]].value > 1.0)]

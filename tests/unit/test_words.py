@@ -173,7 +173,7 @@ def test_the_axis_that_is_wrong_is_named(rng):
         error = autoregression(rng, 61, 100, 3)
         error[..., 1] *= np.sqrt(1.5)
         text = verdict_on(error).reasons[0]
-        count += "mainly axis 1" in text or "in axis 1" in text
+        count += re.search("mainly axis 1|in axis 1|axis 1 too small", text) is not None
     assert count >= stats.binom.ppf(SURE, 30, 0.9)
 
 
@@ -384,7 +384,7 @@ def test_a_few_runs_that_make_the_mean_are_said(rng):
     """The words that must not be said of one run are said where they are due."""
     error = independent(rng, 30, 10, 3)
     error[0] *= 1e3
-    assert "in the mean; a few runs make up that mean" in verdict_on(error).reasons[0]
+    assert "; a few runs make up that mean;" in verdict_on(error).reasons[0]
 
 
 def test_correlations_that_look_the_same_are_not_named(rng):

@@ -219,7 +219,7 @@ def bias_text(v: Findings, in_steps: bool) -> str:
     if in_steps:
         size = ""
         if v.bias.size is not None:
-            size = f" {_sigmas(v.bias.size)} sigma in {v.bias.axis}"
+            size = f" {_sigmas(v.bias.size)} sigma in {v.bias.axis},"
         return f"mean error{size} in {v.place(v.bias.step or 1)}{rest}"
     sure = [(axis, interval) for axis, interval in v.bias.by_axis.items() if not interval.holds(0.0)]
     sure.sort(key=lambda item: -abs(item[1].value))

@@ -5,6 +5,7 @@ The seed of ``rng`` is fixed and was not chosen; faults are so large that a verd
 
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, rat
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.judged_filters import TERMINAL, cells, document
 from consistency.referee.document.wording import PLAIN, written
+from consistency.referee.pages.files_report import compose_files
+from consistency.referee.types import Failure
 
 
 def judged(error, **settings):
@@ -70,6 +73,26 @@ def test_credibility_and_p_values_are_details(rng):
         (entry,) = document({"f": verdict}, verbose=verbose).reasons
         assert set(verdict.details).isdisjoint(entry.others) is not verbose
         assert "2-sigma coverage" in " ".join(entry.others)
+
+
+def test_pages_leave_out_credibility_indices(rng):
+    """Nothing on a page of files says what they are."""
+    error = 2.0 * independent(rng, 40, 6, 3)
+    record = Record("f", error, identities(error), axes=("x", "y", "heading"))
+    document = repr(compose_files([record], {"f": judge(record)}, "f", {}))
+    assert "2-sigma coverage" in document
+    assert "noncredibility" not in document
+
+
+def test_a_verdict_that_failed_plans_no_runs(rng):
+    error = independent(rng, 20, 6, 3)
+    record = Record("f", error, identities(error))
+    settings = Settings(1e-5, detect=1.2)
+    assert judge(record, settings).reasons[0].endswith("such runs would probably decide")
+    failed = judge(replace(record, failures=(Failure(3, 2, "it broke"),)), settings)
+    assert failed.status == "failed"
+    assert failed.reasons[1].startswith("no other fault found")
+    assert "would probably decide" not in " ".join(failed.reasons)
 
 
 def test_a_fault_of_a_correlation_names_the_combination(rng):

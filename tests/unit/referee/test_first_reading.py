@@ -89,7 +89,7 @@ def test_a_verdict_that_failed_plans_no_runs(rng):
     record = Record("f", error, identities(error))
     settings = Settings(1e-5, detect=1.2)
     assert judge(record, settings).reasons[0].endswith("such runs would probably decide")
-    failed = judge(replace(record, failures=(Failure(3, 2, "it broke"),)), settings)
+    failed = judge(replace(record, failures=(Failure("f", 3, 2, "it broke"),)), settings)
     assert failed.status == "failed"
     assert failed.reasons[1].startswith("no other fault found")
     assert "would probably decide" not in " ".join(failed.reasons)

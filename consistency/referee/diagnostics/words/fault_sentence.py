@@ -10,7 +10,7 @@ from consistency.referee.diagnostics.verdict.parts import Scale
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.faults import (
     bias_text,
-    innovations_text,
+    innovation_faults,
     joint_text,
     opposite,
     scale_text,
@@ -19,6 +19,8 @@ from consistency.referee.diagnostics.words.faults import (
 )
 from consistency.referee.diagnostics.words.groups import groups_text
 from consistency.referee.diagnostics.words.numbers import SMALLEST_P, ratio_text
+
+NAMED = {"biased": BIAS, "heavy-tailed": ["outliers"], "overconfident": SCALE, "conservative": SCALE}  # by statuses
 
 
 def fault_sentence(v: Findings, s: Scale) -> str:
@@ -48,10 +50,8 @@ def fault_sentence(v: Findings, s: Scale) -> str:
         parts.append(groups_text(v.by_group, GROUP in v.faults))
     if len(v.faults) == 1:
         parts += [ALONE[question] for question in v.faults if question in ALONE]
-    if "innovation scale" in v.faults and v.innovations is not None:
-        parts.append(innovations_text(v, v.innovations))
-    if "innovation whiteness" in v.faults:
-        parts.append("innovations correlated over steps")
+    if v.innovations is not None:
+        parts += innovation_faults(v, v.innovations)
     if (of_scale or GROUP in v.faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
@@ -59,10 +59,9 @@ def fault_sentence(v: Findings, s: Scale) -> str:
 
 def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
     """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
-    named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
     p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
-    return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
+    return questions != NAMED.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)
 
 
 def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:

@@ -168,13 +168,10 @@ def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
 def _axes_text(v: Findings) -> str:
     """The fault shows in an axis, a group or a direction alone, or in opposite axes."""
     assert v.axes is not None
-    side = SIDES.get(v.status, 0)
-    if v.settings.one_sided:
-        side = 1
     off: dict[str, Interval] = {}
-    if side != -1:
+    if v.status != "conservative":
         off |= _wrong(v, 1)
-    if side != 1:
+    if not v.settings.one_sided:
         off |= _wrong(v, -1)
     largest = v.axes.largest
     if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in off.values()):
@@ -281,13 +278,24 @@ def tails_text(v: Findings) -> str:
     return f"outlier in {where}: {short(v.tails.distance)} sigma from the other {v.unit}s"
 
 
-def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> str:
+def innovation_faults(v: Findings, i: Innovations) -> list[str]:
+    """The faults that were found in the innovations."""
+    texts = []
+    if "innovation scale" in v.faults:
+        texts.append(_innovation_scale(v, i))
+    if "innovation whiteness" in v.faults:
+        texts.append("innovations correlated over steps")
+    return texts
+
+
+def _innovation_scale(v: Findings, i: Innovations) -> str:
     """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
     far = i.outliers
     if far is None:
+        size = "smaller"
         if i.ratio > 1:
-            return f"{they} larger than stated"
-        return f"{they} smaller than stated"
+            size = "larger"
+        return f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})"
     are = "are outliers, the largest"
     if far.count == 1:
         are = "is an outlier,"

@@ -404,23 +404,21 @@ def _without_truth(v: Findings, i: Innovations) -> str:
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
             "filter are neither white nor of the stated size even if it is right"
         )
-    parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
-    if "innovation scale" in v.faults:
-        from consistency.referee.diagnostics.words.faults import innovations_text
-
-        parts.append(innovations_text(v, i, "they are"))
-    if "innovation whiteness" in v.faults:
-        parts.append("they are correlated over steps")
+    parts = []
     shown = i.equivalence
-    if not v.faults and shown is not None:
-        is_shown = "is not shown to be"
+    if v.faults:
+        from consistency.referee.diagnostics.words.faults import innovation_faults
+
+        parts += innovation_faults(v, i)
+    elif shown is not None:
+        is_shown = "but their NIS per degree of freedom {} is not shown to be"
         if shown.shown:
-            is_shown = "is shown to be"
+            is_shown = "and their NIS per degree of freedom {} is shown to be"
         ratio = _ratio_of_test(Interval(i.ratio, *UNKNOWN_ENDS), shown)
-        parts.append(f"their NIS per degree of freedom {ratio} {is_shown} {_between(shown)}")
+        parts.append(f"no fault found in the innovations, {is_shown.format(ratio)} {_between(shown)}")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
-    return "; ".join(parts)
+    return "; ".join([*parts, "without truth most pose errors cannot be seen"])
 
 
 def _nis(i: Innovations) -> str:

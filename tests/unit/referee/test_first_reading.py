@@ -15,6 +15,7 @@ import consistency as cs
 from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
+from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.judged_filters import TERMINAL, cells, document
 from consistency.referee.document.wording import PLAIN, written
@@ -63,6 +64,17 @@ def test_the_strongest_fault_comes_first(rng):
     assert found.keys() >= {"scale", "bias in some step"}
     sentence = verdict.reasons[0]
     assert re.match(r"overconfident: covariance [a-z ]*too small by x[^;]*; mean error ", sentence)
+
+
+def test_what_the_status_says_comes_before_a_fault_that_is_surer(rng):
+    error = 2.0 * (0.5 + independent(rng, 100, 6, 3))
+    verdict = judged(error)
+    assert verdict.status == "overconfident"
+    answers = tuple(replace(a, adjusted=1e-9 if "bias" in a.question else 1e-3) for a in verdict.answers)
+    sentence = reasons(replace(verdict, answers=answers))[0]
+    assert re.match(r"overconfident: covariance about the mean too small by .*; mean error ", sentence)
+    biased = judged(0.5 + independent(rng, 100, 6, 3))
+    assert biased.reasons[0].startswith("biased: mean error ")
 
 
 def test_credibility_and_p_values_are_details(rng):

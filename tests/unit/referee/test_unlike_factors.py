@@ -185,6 +185,16 @@ def test_the_status_depends_on_pairs_that_are_shown(rng, monkeypatch, shown, pai
     assert verdict.status == status
 
 
+def test_a_wrong_sign_is_named_before_a_correlation_that_is_farther_off(rng):
+    true = np.array([[1.0, -0.3, 0.8], [-0.3, 1.0, 0.0], [0.8, 0.0, 1.0]])
+    stated = np.array([[1.0, 0.3, 0.0], [0.3, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    error = independent(rng, 200, 30, 3) @ np.linalg.cholesky(true).T
+    verdict = judge(Record("f", error, np.broadcast_to(stated, (200, 30, 3, 3))), Settings(SURE))
+    assert verdict.shape.pair == (0, 1)
+    assert verdict.shape.alone
+    assert verdict.status == "inconsistent"
+
+
 def of(ratios, status="overconfident", subset=None, allow=None):
     """Findings with these ratios of axes, and blocks of them where they are given."""
     names = tuple(name for name in ratios if name not in ("position", "attitude", "velocity"))

@@ -25,9 +25,10 @@ NAMED = {"biased": BIAS, "heavy-tailed": ["outliers"], "overconfident": SCALE, "
 
 def fault_sentence(v: Findings, s: Scale) -> str:
     """The sentence where a question found a fault."""
-    of_scale = _any_of(SCALE, v.faults)
-    of_bias = _any_of(BIAS, v.faults)
-    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
+    faults = set(v.faults)
+    of_scale = faults.intersection(SCALE)
+    of_bias = faults.intersection(BIAS)
+    is_asked = any(answer.question in BIAS for answer in v.answers)
     found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
     contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in v.faults
     if v.status == "heavy-tailed" or "outliers" in v.faults or (contrary and not opposite(v)):
@@ -38,7 +39,7 @@ def fault_sentence(v: Findings, s: Scale) -> str:
     if of_scale and v.status not in ("biased", "heavy-tailed"):
         scale = scale_text(v)
         found.append((scale, SCALE))
-    if _any_of(SHAPE, v.faults) and v.status not in ("biased", "heavy-tailed"):
+    if faults.intersection(SHAPE) and v.status not in ("biased", "heavy-tailed"):
         found.append((shape_text(v, scale), SHAPE))
     if JOINT in v.faults and v.joint is not None and v.status != "heavy-tailed":
         found.append((joint_text(v, v.joint), [JOINT]))
@@ -62,7 +63,3 @@ def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
     p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
     return questions != NAMED.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)
-
-
-def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
-    return any(question in asked for question in questions)

@@ -265,10 +265,10 @@ def _level(v: Findings, s: Scale, location: Location) -> str:
         text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst {v.unit}"
     if s.judged_steps > 1:
         where = []
-        if location.above:
-            where.append(f"{location.above} above")
-        if location.below:
-            where.append(f"{location.below} below")
+        if location.steps_above:
+            where.append(f"{location.steps_above} above")
+        if location.steps_below:
+            where.append(f"{location.steps_below} below")
         outside = " and ".join(where) or "none"
         text += f"; {v.places} outside the simultaneous band: {outside} of {s.judged_steps}"
     return text

@@ -38,8 +38,8 @@ def are_alike(intervals: list[Interval]) -> bool:
 def unlike_ratios(v: Findings) -> dict[str, Interval]:
     """Blocks and axes whose ratio is not 1, the farthest first; none where all may be off by one factor.
 
-    Of a conservative covariance those that are too large alone, as nothing in it has to grow; where that is not a fault,
-    those that are too small.
+    Of a conservative covariance those that are too large alone, as nothing in it has to grow. Where that is not a
+    fault, those that are too small.
     """
     if v.axes is None:
         return {}

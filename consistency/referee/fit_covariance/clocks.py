@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import inverse, log, matrices
-from consistency.referee.readers.clock_offset import MOST, REACH
+from consistency.referee.readers.clock_offset import GRID, MOST, REACH, refined
 from consistency.referee.readers.truth_matching import Poses, truth_at
 from consistency.referee.types import Array
 
@@ -18,8 +17,6 @@ LONG = 1.0  # s, of the motions that are compared
 KEPT = 0.9  # of the squared errors, the smallest: jumps decide nothing
 PARTS = 5  # drives that show how well the offset is known; fewer ones are cut into as many parts
 UNSURE = 0.1  # s, standard error of an offset that is not used
-STEPS = np.geomspace(0.004, REACH, 12)
-GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
 class TimedMotions(NamedTuple):
@@ -97,6 +94,4 @@ def _best(parts: Sequence[TimedMotions]) -> float:
     is_told = np.nanmax(sizes) - sizes[best] > 1e-6
     if best in (0, len(GRID) - 1) or not is_told:
         return float("nan")
-    bounds = GRID[best - 1], GRID[best + 1]
-    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": 1e-4})
-    return float(found.x if found.fun < sizes[best] else GRID[best])
+    return refined(size, sizes, 1e-4)

@@ -147,7 +147,6 @@ def _block(found: Correction, group: str, b: int) -> dict[str, Any]:
 
 
 def _held_out(one: HeldOut) -> dict[str, Any]:
-    coverage = {
-        f"inside_{level:.0%}".rstrip("%"): share for level, share in zip(LEVELS, one.covered(LEVELS), strict=True)
-    }
+    names = (f"inside_{100 * level:.0f}" for level in LEVELS)
+    coverage = dict(zip(names, one.covered(LEVELS), strict=True))
     return {"ratio": one.ratio.value, "ratio_interval": one.ratio[1:], **coverage, "log_score": one.scores.mean()}

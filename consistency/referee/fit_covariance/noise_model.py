@@ -29,17 +29,30 @@ from consistency.referee.fit_covariance.covariance_ratios import (
     judged_by,
 )
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.mean_by_motion import MotionDependence, mean_by_motion
-from consistency.referee.fit_covariance.motion_windows import ENOUGH, PIECES, DriveWindows, cut_windows, span_of
-from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
-from consistency.referee.fit_covariance.persistence import (
+from consistency.referee.fit_covariance.mean_differences import (
+    MotionDependence,
     PersistentError,
-    SecondErrors,
-    doubts,
-    errors_of_second,
+    mean_by_motion,
     persistent_errors,
 )
-from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
+from consistency.referee.fit_covariance.motion_windows import (
+    ENOUGH,
+    PIECES,
+    DriveWindows,
+    cut_windows,
+    matrices_of,
+    span_of,
+    vectors_of,
+)
+from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
+from consistency.referee.fit_covariance.refusals import (
+    RotationGrowth,
+    doubts,
+    require_poses,
+    require_sound,
+    rotation_growth,
+)
+from consistency.referee.fit_covariance.second_estimator import SecondErrors, errors_of_second
 from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry.groups import log, matrices
 from consistency.referee.readers.pipeline.relative_motions import Stretch
@@ -100,7 +113,7 @@ class NoiseModel:
 
     def correct(self, motions: ArrayLike) -> Array:
         """Estimated motions (K, 3) or (K, 7) with the mean error taken out, as matrices (K, d + 1, d + 1)."""
-        return np.asarray(self.noise.mean.corrected(_matrices(motions, self.noise)[None])[0])
+        return matrices_of(self.noise.mean.corrected(_motions(motions, self.noise)))
 
     def covariance(self, motion: ArrayLike) -> Array:
         """Covariance (n, n) of Log(D^-1 M) of a corrected motion D: the error in the body's frame at its end.
@@ -114,7 +127,7 @@ class NoiseModel:
         InputError
             The motion is not of the model's space, or not finite.
         """
-        steps = _matrices(motion, self.noise)
+        steps = _motions(motion, self.noise)
         if len(steps) == 1:
             steps = evenly(steps[0], PIECES)
         return np.asarray(self.noise.covariance(steps[None])[0])
@@ -251,23 +264,25 @@ def caution(ratio: Ratio, probability: float) -> float:
 
 
 def evenly(motion: Array, pieces: int) -> Array:
-    """Divide a motion (d + 1, d + 1) into equal pieces of one screw, (pieces, d + 1, d + 1)."""
-    twist = log(motion[None])[0] / pieces
-    d = motion.shape[-1] - 1
-    x, y, z = twist[d:] if d == 3 else (0.0, 0.0, twist[d])
-    rotation = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    generator = np.zeros((d + 1, d + 1))
-    generator[:d, :d] = rotation[:d, :d]
+    """Divide a motion (n,) into equal pieces of one screw, (pieces, n)."""
+    T = matrices_of(motion[None])
+    twist = log(T)[0] / pieces
+    d = len(T[0]) - 1
+    turn = np.zeros(3)
+    turn[d - len(twist) :] = twist[d:]
+    generator = np.zeros_like(T[0])
+    generator[:d, :d] = np.cross(turn, np.eye(3)).T[:d, :d]
     generator[:d, d] = twist[:d]
-    return np.repeat(linalg.expm(generator)[None], pieces, axis=0)
+    return np.repeat(vectors_of(linalg.expm(generator)[None]), pieces, axis=0)
 
 
-def _matrices(motion: ArrayLike, noise: WhiteNoise) -> Array:
-    values = np.atleast_2d(np.asarray(motion, float))
+def _motions(given: ArrayLike, noise: WhiteNoise) -> Array:
+    """Motions (K, n) of poses (K, 3) or (K, 7), or of one."""
+    values = np.atleast_2d(np.asarray(given, float))
     width = 3 if len(noise.axes) == 3 else 7
     if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
-        raise InputError(f"motion: needs {width} finite numbers a step, got an array of {np.shape(motion)}")
-    return matrices(values)
+        raise InputError(f"motion: needs {width} finite numbers a step, got an array of {np.shape(given)}")
+    return vectors_of(matrices(values))
 
 
 def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:

@@ -18,11 +18,13 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.intervals import interval_of
+from consistency.referee.fit_covariance.likelihood import nees_of
+from consistency.referee.fit_covariance.mean_differences import TERMS, PersistentError, variance_between
 from consistency.referee.fit_covariance.model_text import noise_lines, sentence
 from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of
+from consistency.referee.fit_covariance.motion_windows import matrices_of as pieces_of
 from consistency.referee.fit_covariance.noise_model import caution
-from consistency.referee.fit_covariance.persistence import TERMS, PersistentError, variance_between
-from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, revisits, rotation_growth
+from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, rotation_growth
 from consistency.referee.fit_covariance.systematic_errors import (
     FORWARD,
     Mean,
@@ -36,7 +38,6 @@ from consistency.referee.fit_covariance.white_noise import (
     fit_noise,
     fit_terms,
     jitter_of,
-    nees_of,
     terms_of,
 )
 from consistency.referee.geometry.groups import composed, inverse, log, vectors
@@ -143,7 +144,7 @@ def test_an_error_of_a_piece_is_carried_to_the_end(group, rng):
     perfect = replace(w, true=w.motions)
     for k in (0, 7, 20):
         e = 1e-6 * rng.normal(size=(len(A), n))
-        rest = np.array(w.pieces)
+        rest = pieces_of(w.pieces)
         before = np.eye(w.d + 1)[None].repeat(len(A), 0)
         for j in range(k):
             before = before @ rest[:, j]
@@ -193,7 +194,7 @@ def test_terms_are_sums_over_pieces(group, rng):
     for k, axis in ((3, 0), (5, n - 1)):
         by_hand = np.zeros((2, n, n))
         for piece in range(20):
-            T = w.pieces[k, piece]
+            T = pieces_of(w.pieces)[k, piece]
             turn = np.arctan2(T[1, 0], T[0, 0]) if d == 2 else Rotation.from_matrix(T[:3, :3]).magnitude()
             for size, out in zip((np.linalg.norm(T[:d, d]), abs(turn)), by_hand, strict=True):
                 out += 0.5 * size * sum(np.outer(A[k, j][:, axis], A[k, j][:, axis]) for j in (piece, piece + 1))
@@ -417,36 +418,6 @@ def test_estimate_and_truth_are_the_same(rng):
     drive = drives(rng, 1)[0]
     with pytest.raises(InputError, match="same positions"):
         fit_noise(cut_windows([replace(drive, estimate=drive.truth)], span_of(SPAN)))
-
-
-def test_a_loop_that_is_closed_has_small_errors_between_passes(rng):
-    """Circles of 250 m: white noise adds up between passes; a heading that is corrected at each pass does not."""
-
-    def circles(closed):
-        found = []
-        for i in range(4):
-            n = 4000
-            angle = 2 * np.pi * np.arange(n) / 500
-            T = np.tile(np.eye(3), (n, 1, 1))
-            T[:, 0, 0] = T[:, 1, 1] = np.cos(angle)
-            T[:, 1, 0], T[:, 0, 1] = np.sin(angle), -np.sin(angle)
-            T[:, 0, 2], T[:, 1, 2] = 250 / (2 * np.pi) * np.sin(angle), 250 / (2 * np.pi) * (1 - np.cos(angle))
-            yaw = np.cumsum(0.002 * rng.normal(size=n))
-            if closed:  # what has gathered in a lap is taken out at its end
-                laps = np.arange(n) // 500
-                ends = np.concatenate([[0.0], yaw[499::500]])
-                yaw = yaw - ends[laps]
-            E = np.tile(np.eye(3), (n, 1, 1))
-            E[:, 0, 0] = E[:, 1, 1] = np.cos(yaw)
-            E[:, 1, 0], E[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
-            found.append(Drive(f"lap {i}", np.arange(n) * 0.5, np.arange(n), T @ E, T))
-        return found
-
-    for closed in (False, True):
-        made = circles(closed)
-        ratio, chance = revisits(cut_windows(made, span_of("5m")))
-        assert (ratio > 1.2 and chance > 0.002) if not closed else (chance < 0.01 and ratio < 1.2)
-    assert np.isnan(revisits(cut_windows(made, span_of("5s")))[0])
 
 
 def test_growth_of_white_noise_and_of_a_persistent_drift(rng):

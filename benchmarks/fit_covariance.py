@@ -277,7 +277,8 @@ def told(rng: np.random.Generator, case: Case, fresh: DriveWindows) -> tuple[str
     """
     made = drives(rng, case.fitted, case.world, case.length)
     judged = [drive(rng, case.later, f"judged {i}", case.length) for i in range(case.judged)]
-    names, every = ",".join(each.name for each in judged) or None, [*made, *judged]
+    names = ",".join(each.name for each in judged) or (None if case.fitted > 1 else "half")
+    every = [*made, *judged]
     try:
         windows = cut_windows(every, span_of(SPAN))
         require_sound(windows, True)

@@ -91,11 +91,6 @@ class JudgedSpan:
         return "undecided" if "undecided" in found else "consistent"
 
 
-def are_halves(windows: DriveWindows, held_out: str | None) -> bool:
-    """Whether second halves of drives are judged by a fit to the first ones."""
-    return held_out == HALF or (held_out is None and len(windows.drives) == 1)
-
-
 def folds_of(
     windows: DriveWindows,
     held_out: str | None,
@@ -114,7 +109,7 @@ def folds_of(
         A name is not a drive, or nothing is left to fit or to judge.
     """
     every = np.arange(len(windows.drives))
-    if are_halves(windows, held_out):
+    if held_out == HALF:
         since = [np.array([_middle(windows.last[windows.drive == i]) for i in every])]
     elif held_out is None:
         since = [np.where(every == i, 0, NEVER) for i in np.unique(windows.drive)]

@@ -24,7 +24,6 @@ from consistency.referee.fit_covariance.covariance_ratios import (
     Fold,
     JudgedSpan,
     Ratio,
-    are_halves,
     folds_of,
     judged_by,
 )
@@ -207,10 +206,12 @@ def fit_covariance(
     require_sound(windows, correct)
     jitter = jitter_of(fit_noise(windows, correct, by_turn), windows)
     fit = partial(fit_noise, correct=correct, by_turn=by_turn, jitter=jitter)
+    if held_out is None and len(drives) == 1:
+        held_out = HALF
+    by_halves = held_out == HALF
     noise, folds = folds_of(windows, held_out, fit)
     growth = rotation_growth(windows, noise.mean)
     lasting = persistent_errors(noise, windows)
-    by_halves = are_halves(windows, held_out)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, not by_halves).whole, cautious)
         noise = replace(noise, factor=factor)
@@ -218,8 +219,9 @@ def fit_covariance(
     spans = _judge_spans(folds, windows, not by_halves)
     record = record_of_motions(stretches_of(windows, folds), windows.axes)
     judged = np.unique(np.concatenate([fold.judged for fold in folds]))
-    is_by_name = not (by_halves or held_out is None)
-    fitted = windows.of(~np.isin(windows.drive, judged)) if is_by_name else windows
+    fitted = windows
+    if held_out not in (None, HALF):
+        fitted = windows.of(~np.isin(windows.drive, judged))
     n = len(windows.axes)
     variances = variance_intervals(noise, fitted)
     return NoiseModel(
@@ -233,7 +235,7 @@ def fit_covariance(
         verdict=judge(record, keep_record=True),
         fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
         judged_drives=tuple(drives[i].name for i in judged),
-        held_out=HALF if by_halves else held_out or IN_TURN,
+        held_out=held_out or IN_TURN,
         growth=growth,
         warnings=tuple(doubts(noise, windows, growth, lasting)),
         lasting=lasting,

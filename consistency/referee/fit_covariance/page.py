@@ -20,6 +20,7 @@ from consistency.referee.fit_covariance.likelihood import nees_of
 from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import mean_square, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
+from consistency.referee.pages.trajectory import ellipse
 from consistency.referee.show.painting import (
     canvas,
     curve,
@@ -42,7 +43,6 @@ SHOWN = 3  # spans with a panel of errors
 MOST_ROWS = 30  # runs that have a row
 ROW = 0.14  # in, height of one
 MANY = 2000  # errors of motions that are drawn
-CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
@@ -82,16 +82,13 @@ def draw_noise(model: NoiseModel) -> Drawing:
 
 def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
     windows = error_windows(model, judged)
-    error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
-    values, vectors = np.linalg.eigh(C)
-    radius = np.sqrt(float(stats.chi2.ppf(CONFIDENCE, 2)))
-    ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
-    squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
-    inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
+    error = windows.errors[:, :2]
+    C = model.noise.covariance(windows.pieces)[:, :2, :2]
+    inside = float((nees_of(error, C) < stats.chi2.ppf(CONFIDENCE, 2)).mean())
     axes.axvline(0.0, **stroke(ZERO))
     axes.axhline(0.0, **stroke(ZERO))
     points(axes, error[:, 0], error[:, 1], EACH, limit=MANY)
-    path(axes, ellipse.T, solid(style(1)))
+    path(axes, ellipse(np.zeros(2), C.mean(axis=0)), solid(style(1)))
     title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
     axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 

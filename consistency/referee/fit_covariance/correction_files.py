@@ -76,8 +76,7 @@ def _change(
     """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out."""
     if run not in of_runs:
         return None
-    factor, floor = of_runs[run][place_in(groups, value)].of_components()
-    return dict(zip(axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
+    return of_runs[run][place_in(groups, value)].by_name(axes)
 
 
 def place_in(groups: Groups | None, value: str) -> int:
@@ -168,9 +167,5 @@ def gtsam_noise(P{value}):
 
 def _table_of_factors(found: Correction) -> str:
     """Lines of the table of factors and floors by group and component."""
-    lines = []
-    for group, fit in found.shown.items():
-        factor, floor = fit.factors.of_components()
-        numbers = dict(zip(found.axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
-        lines.append(f"    {group!r}: {numbers},\n")
+    lines = [f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items()]
     return "".join(lines)

@@ -69,6 +69,11 @@ class Factors:
         shares = members(self.blocks)
         return self.factor @ shares, self.floor @ shares
 
+    def by_name(self, axes: Sequence[str]) -> dict[str, tuple[float, float]]:
+        """Factor and floor of each component by its name."""
+        factor, floor = self.of_components()
+        return dict(zip(axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
+
     def applied(self, P: Array) -> Array:
         """Corrected covariances of stated ones, (..., n, n)."""
         factor, floor = self.of_components()
@@ -186,7 +191,8 @@ def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
     Q = []
     for error, P in steps_of_runs(record):
         parts = error[..., None] * members(blocks).T
-        Q.append(np.mean(np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts), axis=0))
+        products = np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts)
+        Q.append(products.mean(axis=0))
     return np.array(Q)
 
 
@@ -232,12 +238,14 @@ def likeness(record: Record, block: Block) -> float:
 
     1 where each covariance is the same multiple of the identity.
     """
-    first, second = [], []
-    for _, P in steps_of_runs(record):
-        inverse = np.linalg.inv(block.of(P))
-        first.append(np.trace(inverse, axis1=1, axis2=2).mean())
-        second.append((inverse**2).sum(axis=(1, 2)).mean())
-    return float(np.mean(first) ** 2 / (len(block) * np.mean(second)))
+    stated = [block.of(P) for _, P in steps_of_runs(record)]
+    squares = [np.square(np.linalg.inv(P)).sum(axis=(1, 2)).mean() for P in stated]
+    return float(len(block) * mean_precision(stated) ** 2 / np.mean(squares))
+
+
+def mean_precision(covariances: Sequence[Array]) -> float:
+    """Mean over runs, steps and components of the diagonal of P^-1, of covariances (k, n, n) of each run."""
+    return float(np.mean([np.diagonal(np.linalg.inv(P), axis1=1, axis2=2).mean() for P in covariances]))
 
 
 def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
@@ -304,16 +312,14 @@ def derivatives(C: Array, factors: Factors, free: Indices) -> Array:
     rates = 0.5 * own / factors.factor[:, None]  # of the square root of a factor, over it
     scaled = C - np.diag(factors.of_components()[1])
     by_factor = (rates[:, :, None] + rates[:, None, :]) * scaled[:, None]
-    by_floor = np.broadcast_to(own[free, :, None] * np.eye(n), (len(C), len(free), n, n))
-    return np.concatenate([by_factor, by_floor], axis=1)
+    by_floor = own[free, :, None] * np.eye(n)
+    return np.concatenate([by_factor, np.broadcast_to(by_floor, (len(C), *by_floor.shape))], axis=1)
 
 
 def relative_sizes(record: Record, whole: Factors, others: Sequence[Factors]) -> Array:
     """Corrected variances of each block by other factors, over those by ``whole``, (others, B)."""
-    precision = np.empty(len(whole.blocks))
-    for b, block in enumerate(whole.blocks):
-        inverses = [np.linalg.inv(block.of(whole.applied(P))) for _, P in steps_of_runs(record)]
-        precision[b] = np.mean([np.trace(each, axis1=1, axis2=2).mean() for each in inverses]) / len(block)
+    corrected = [whole.applied(P) for _, P in steps_of_runs(record)]
+    precision = np.array([mean_precision([block.of(P) for P in corrected]) for block in whole.blocks])
     factor = np.array([each.factor for each in others]) / whole.factor
     floor = np.array([each.floor for each in others])
     return np.asarray(factor * (1.0 - whole.floor * precision) + floor * precision)

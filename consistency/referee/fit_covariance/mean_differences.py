@@ -120,7 +120,9 @@ def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) 
     numbers = windows.errors.size
     free = max(numbers - X.shape[-1] * len(drives), 1)  # what the constants leave
     error = np.std(scores, ddof=1) * np.sqrt(numbers / free / len(scores))
-    return float(2.0 * stats.t.sf(abs(np.mean(scores)) / error, len(scores) - 1)) if error > 0 else 1.0
+    if not error > 0:
+        return 1.0
+    return float(2.0 * stats.t.sf(abs(np.mean(scores)) / error, len(scores) - 1))
 
 
 def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:

@@ -138,7 +138,8 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     sound = moves & ~jumps
     if not sound.any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
-    return replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum())).of(sound)
+    left_out = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
+    return left_out.of(sound)
 
 
 def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> DriveWindows:
@@ -243,6 +244,12 @@ def ways(motions: Array) -> Array:
 def angles(motions: Array) -> Array:
     """Angle by which each motion (..., n) turns, rad, at least 0."""
     return norms(motions[..., d_of(motions) :])
+
+
+def turn_per_way(motions: Array) -> Array:
+    """Angle over length of each motion, rad/m; 0 of one that turns without a way."""
+    way = ways(motions)
+    return angles(motions) / np.where(way > 0, way, np.inf)
 
 
 def rests(pieces: Array) -> Array:

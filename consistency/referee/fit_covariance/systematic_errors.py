@@ -12,13 +12,13 @@ from consistency.referee.fit_covariance.intervals import student
 from consistency.referee.fit_covariance.motion_windows import (
     BLOCKS,
     DriveWindows,
-    angles,
     blocks_of,
     d_of,
     matrices_of,
     mean_square,
     rests,
     root_mean_square,
+    turn_per_way,
     ways,
 )
 from consistency.referee.geometry.groups import adjoint, inverse
@@ -53,11 +53,11 @@ class Mean:
     def corrected(self, pieces: Array) -> Array:
         """Motions (..., n) with this mean taken out; none goes backwards by a slip."""
         d = d_of(pieces)
-        way = ways(pieces)
-        longer = np.maximum(way + self.slip * np.where(way > 0, angles(pieces), 0.0), 0.0)
+        way = ways(pieces)[..., None]
+        longer = np.maximum(1.0 + self.slip * turn_per_way(pieces)[..., None], 0.0)
         out = self.turn * pieces
-        out[..., :d] = pieces[..., :d] * (self.way * longer / np.where(way > 0, way, 1.0))[..., None]
-        out[..., d:] += longer[..., None] * np.array(self.drift)
+        out[..., :d] = self.way * longer * pieces[..., :d]
+        out[..., d:] += longer * way * np.array(self.drift)
         return out
 
     def applied(self, windows: DriveWindows) -> DriveWindows:
@@ -332,7 +332,7 @@ def jacobian(pieces: Array) -> Array:
     local[..., :d, 0] = along
     local[..., d:, 1] = pieces[..., d:]
     local[..., d:, SCALES:-1] = way[..., None, None] * np.eye(axes)
-    local[..., :d, -1] = along * (angles(pieces) / np.where(way > 0, way, np.inf))[..., None]
+    local[..., :d, -1] = along * turn_per_way(pieces)[..., None]
     W, P, n, p = local.shape
     A = np.moveaxis(carriers(pieces)[:, 1:], 1, 2)
     return np.asarray(A.reshape(W, n, P * n) @ local.reshape(W, P * n, p))

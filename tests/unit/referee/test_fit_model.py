@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.intervals import interval_of
 from consistency.referee.fit_covariance.likelihood import nees_of
 from consistency.referee.fit_covariance.mean_differences import TERMS, PersistentError, variance_between
 from consistency.referee.fit_covariance.model_text import noise_lines, sentence
-from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of
+from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of, vectors_of
 from consistency.referee.fit_covariance.motion_windows import matrices_of as pieces_of
 from consistency.referee.fit_covariance.noise_model import caution
 from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, rotation_growth
@@ -114,6 +114,19 @@ def test_spans_are_refused():
     for bad in ("0m", "-1m", "1km", "m", "", "1.5"):
         with pytest.raises(InputError, match="--span"):
             span_of(bad)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_motions_as_vectors_are_the_same_motions(group, rng):
+    """Also of none at all."""
+    w = cut(group, rng)
+    T = pieces_of(w.pieces)
+    turn = T[..., :-1, :-1]
+    assert_allclose(turn @ np.swapaxes(turn, -1, -2), np.broadcast_to(np.eye(w.d), turn.shape), atol=1e-12)
+    assert_allclose(vectors_of(T), w.pieces, atol=1e-12)
+    assert_allclose(T[..., :-1, -1], w.pieces[..., : w.d])
+    assert vectors_of(T[:0]).shape == w.pieces[:0].shape
+    assert pieces_of(w.pieces[:0]).shape == T[:0].shape
 
 
 def test_planar_part_of_motions_in_space(rng):

@@ -7,6 +7,7 @@ import pytest
 import relative_poses as spatial
 from fit_covariance import OWN_CONSTANTS, World, drives, matrices_of
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
 
 import consistency as cs
 from consistency.referee.errors import InputError
@@ -185,6 +186,22 @@ def test_noise_of_the_way_by_which_windows_are_divided_is_not_a_dependence(rng):
     thirds = np.searchsorted(np.quantile(size, [1 / 3, 2 / 3]), size, side="right")
     assert p_value_of(now, now.pieces, thirds, 0) < 1e-3
     assert mean_by_motion(noise, w).p_value > 0.01  # fails in 1 %
+
+
+def test_the_p_value_is_that_of_scores_of_blocks(rng):
+    """Of one drive: errors and the trend of a scale, less what a mean explains of both, in 40 blocks."""
+    w = cut_windows(drives(rng, 1, length=600.0), span_of(SPAN))
+    bins = np.arange(len(w.drive)) % 3
+    size = np.sqrt((w.errors**2).mean(axis=0))
+    X = jacobian_of_mean(w.pieces) / size[:, None]
+    y = (w.errors / size).ravel()
+    asked = (X[..., 1] * bins[:, None]).ravel()
+    own = X.reshape(len(y), -1)
+    y, asked = (each - own @ np.linalg.lstsq(own, each, rcond=None)[0] for each in (y, asked))
+    of_windows = (y * asked).reshape(len(bins), -1).sum(axis=1)
+    scores = [block.sum() for block in np.array_split(of_windows, 40)]
+    t = stats.ttest_1samp(scores, 0.0).statistic * np.sqrt(1.0 - own.shape[1] / len(y))
+    assert p_value_of(w, w.pieces, bins, 1) == pytest.approx(2 * stats.t.sf(abs(t), 39))
 
 
 def test_constants_of_each_drive_are_no_dependence():

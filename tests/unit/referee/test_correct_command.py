@@ -394,9 +394,9 @@ def test_lines_come_back_with_other_covariances_alone(tmp_path):
 
     entries = {2: ("a", "a"), 3: ("a", "b")}
     numbers = TextFile(tmp_path / "a.txt", entries, True, run_column=0)
-    (tmp_path / "a.txt").write_text("# t\n 1  0.5\t2.0  1.0 \r\n2 0.5 2.0 1.0\n\n")
+    (tmp_path / "a.txt").write_text("# t\n 1  0.5   2.0  1.0 \r\n2 0.5 2.0 1.0\n\n")
     text = numbers.restated(lambda run, value: {"a": (4.0, 1.0), "b": (9.0, 0.0)} if run == 1 else None)
-    assert text == "# t\n 1  0.5\t9.0  6.0 \r\n\n"
+    assert text == "# t\n 1  0.5   9.0  6.0 \r\n\n"
     words = TextFile(tmp_path / "a.csv", entries, True, filter_column=0, filter="x, y", by_column=1)
     (tmp_path / "a.csv").write_text('f,road,P,Q\n"x, y", "wet","2.0",\nz,dry,2.0,1.0\n')
     values = []

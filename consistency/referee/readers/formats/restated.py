@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.file_kinds import (
 )
 from consistency.referee.readers.formats.named_columns import DEVIATIONS, roles_of
 from consistency.referee.readers.formats.other_names import covariance_places
-from consistency.referee.readers.formats.pose_covariances import ORDERS, covariance_order
+from consistency.referee.readers.formats.pose_covariances import ORDERS, components_in, covariance_order
 from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS as SIZES
 from consistency.referee.readers.formats.pose_rows import POSE as POSE_COLUMNS
@@ -189,7 +189,7 @@ def _width(path: Path) -> int:
 def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, squared: bool) -> TextFile | None:
     """A file with n^2 numbers of a covariance in a row, its upper triangle, or n of a diagonal, n = 6, 9 or 15."""
     many = len(columns)
-    n = next((n for n in SIZES if many in (n, n * n, n * (n + 1) // 2)), None)
+    n = components_in(many)
     if n is None:
         return None
     order = covariance_order(n, r.covariance_order or ORDERS[0])

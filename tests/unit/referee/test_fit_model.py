@@ -449,6 +449,19 @@ def test_growth_of_white_noise_and_of_a_persistent_drift(rng):
     assert np.isnan(rotation_growth(w, fit_noise(w).mean).power)
 
 
+def test_growth_is_the_slope_of_logarithms(rng):
+    """Weighted by numbers of windows, whose mean squares vary by 2 / W; the variance is doubled."""
+    w = cut_windows(drives(rng, 1, length=300.0), span_of(SPAN))
+    cut = [w.over(10.0 * times) for times in (1, 2, 3)]  # 30, 15 and 10 windows
+    counts = np.array([len(each.drive) for each in cut])
+    squares = [(each.errors[:, 2:] ** 2).mean(axis=0).sum() for each in cut]
+    x, y, weight = np.log([1.0, 2.0, 3.0]), np.log(squares), counts / 2
+    x = x - np.average(x, weights=weight)
+    growth = rotation_growth(w, Mean())
+    assert growth.power == pytest.approx((weight * x * y).sum() / (weight * x**2).sum())
+    assert growth.error == pytest.approx(np.sqrt(2.0 / (weight * x**2).sum()))
+
+
 def test_growth_needs_its_standard_errors():
     assert RotationGrowth(0.3, 0.1).shrinks
     assert not RotationGrowth(0.3, 0.3).shrinks

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -122,39 +121,39 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
     InputError
         No window fits in any drive.
     """
-    parts: list[DriveWindows] = []
+    parts = []
+    long = 0
     refused: list[InputError] = []
-    for number in range(len(drives)):
+    for number, drive in enumerate(drives):
         try:
-            parts.append(_cut_drive(tuple(drives), number, span, planar, pieces))
+            first, last, left_out = _rows_of_windows(drive, span)
         except InputError as error:
             refused.append(error)
+            continue
+        ends = _ends(first, last, pieces)
+        estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:], planar)
+        true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:], planar)
+        true = matrices_of(motions_between(drive.truth, first, last, planar))
+        parts.append((np.full(len(first), number), first, last, estimated, true, true_pieces))
+        long += left_out
     if not parts:
         raise refused[-1]
-    rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ROWS}
-    found = replace(parts[0], **rows, long=sum(part.long for part in parts))
+    rows = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = DriveWindows(tuple(drives), span, planar, *rows, long)
     moves = _moves(found)
     jumps = _jumps(found)
     sound = moves & ~jumps
     if not sound.any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
-    left_out = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
-    return left_out.of(sound)
+    counted = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
+    return counted.of(sound)
 
 
-def _cut_drive(drives: tuple[Drive, ...], number: int, span: Relative, planar: bool, pieces: int) -> DriveWindows:
-    drive = drives[number]
+def _rows_of_windows(drive: Drive, span: Relative) -> tuple[Indices, Indices, int]:
+    """First and last row of each window of a drive, and how many are left out."""
     rows = drive.row if span.unit == "step" else np.arange(len(drive.t))
     first, last, left_out = windows(drive.t, drive.truth[:, :-1, -1], rows, span, drive.name)
-    first = np.searchsorted(rows, first)
-    last = np.searchsorted(rows, last)
-    ends = _ends(first, last, pieces)
-    estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:], planar)
-    true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:], planar)
-    true = matrices_of(motions_between(drive.truth, first, last, planar))
-    return DriveWindows(
-        drives, span, planar, np.full(len(first), number), first, last, estimated, true, true_pieces, left_out
-    )
+    return np.searchsorted(rows, first), np.searchsorted(rows, last), left_out
 
 
 def _ends(first: Indices, last: Indices, pieces: int) -> Indices:

@@ -181,26 +181,22 @@ def ratio_of(
     A single drive has an interval from the means of consecutive windows, of ``values`` (W,), which holds for it alone.
     """
     known = np.isfinite(by_drive) & (by_drive > 0)
-    drives = int(known.sum())
-    spread = reach = float("nan")
-    center = float("nan")
-    if drives > 1:
-        logs = np.log(by_drive[known])
+    ratios = by_drive[known]
+    center = spread = reach = float("nan")
+    if len(ratios) > 1:
+        logs = np.log(ratios)
         if dof is not None:
             half = 0.5 * dof[known]
             logs += np.log(half) - special.digamma(half)
         center, _, high = mean_over_runs(logs)
         spread, reach = float(logs.std(ddof=1)), high - center
-    elif drives == 1:
-        mean = float(values.mean())
-        parts = np.array_split(values, min(BLOCKS, len(values)))
-        middle, _, high = mean_over_runs(np.array([part.mean() for part in parts]))
-        center, reach = np.log(mean), (high - middle) / middle
-        if len(parts) == 1:
-            reach = np.inf
-    low = float(np.exp(center - reach))
-    high = float(np.exp(np.minimum(center + reach, 700.0)))
-    return Ratio(float(np.exp(center)), low, high, spread, drives, len(values), general)
+    elif len(ratios) == 1:
+        parts = [part.mean() for part in np.array_split(values, min(BLOCKS, len(values)))]
+        middle, _, high = mean_over_runs(np.array(parts))
+        center = float(np.log(values.mean()))
+        reach = (high - middle) / middle if len(parts) > 1 else np.inf
+    value, low, high = np.exp(np.minimum([center, center - reach, center + reach], 700.0)).tolist()
+    return Ratio(value, low, high, spread, len(ratios), len(values), general)
 
 
 def shown(ratio: Ratio | Interval) -> str:

@@ -51,9 +51,8 @@ class HeldOut:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
         nees = self.record.nees
         assert nees is not None
-        counted = np.isfinite(nees)
         bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
-        return np.array([average(np.where(counted, nees <= bound, np.nan)) for bound in bounds])
+        return np.array([average(np.where(np.isfinite(nees), nees <= bound, np.nan)) for bound in bounds])
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
@@ -71,8 +70,7 @@ class NoiseModel:
     per_m: tuple[Interval, ...]  # (n,), variances a metre
     per_rad: tuple[Interval, ...]  # (n,)
     spans: tuple[JudgedSpan, ...]  # the first is that of the fit
-    record: Record = field(repr=False)  # judged motions, each a run
-    verdict: Verdict = field(repr=False)  # of the referee on these motions
+    verdict: Verdict = field(repr=False)  # of the referee on judged motions, each a run
     fitted_drives: tuple[str, ...]
     judged_drives: tuple[str, ...]
     held_out: str  # "in turn", "half" or names
@@ -231,7 +229,6 @@ def fit_covariance(
         per_m=variances[:n],
         per_rad=variances[n:],
         spans=spans,
-        record=record,
         verdict=judge(record, keep_record=True),
         fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
         judged_drives=tuple(drives[i].name for i in judged),

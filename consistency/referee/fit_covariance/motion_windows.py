@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -138,8 +139,8 @@ def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, p
         long += left_out
     if not parts:
         raise refused[-1]
-    rows = (np.concatenate(each) for each in zip(*parts, strict=True))
-    found = DriveWindows(tuple(drives), span, planar, *rows, long)
+    rows: dict[str, Any] = dict(zip(ROWS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
+    found = DriveWindows(tuple(drives), span, planar, **rows, long=long)
     moves = _moves(found)
     jumps = _jumps(found)
     sound = moves & ~jumps
@@ -168,7 +169,9 @@ def _moves(of: DriveWindows) -> Array:
     if of.span.unit == "m":
         return np.asarray(way >= STILL * of.span.size)
     angle = angles(of.pieces).sum(axis=1)
-    return np.asarray((way > STILL * np.median(way)) | (angle > STILL * np.median(angle)))
+    goes = way > STILL * np.median(way)
+    turns = angle > STILL * np.median(angle)
+    return np.asarray(goes | turns)
 
 
 def _jumps(of: DriveWindows) -> Array:
@@ -215,7 +218,8 @@ def matrices_of(motions: Array) -> Array:
     """Homogeneous matrices (..., d + 1, d + 1) of motions (..., n)."""
     flat = motions.reshape(-1, motions.shape[-1])
     if flat.shape[1] == 6 and len(flat):
-        flat = np.column_stack([flat[:, :3], Rotation.from_rotvec(flat[:, 3:]).as_quat()])
+        turns = Rotation.from_rotvec(flat[:, 3:])
+        flat = np.column_stack([flat[:, :3], turns.as_quat()])
     T = matrices(flat)
     return T.reshape(*motions.shape[:-1], *T.shape[1:])
 
@@ -226,7 +230,8 @@ def vectors_of(T: Array) -> Array:
     if flat.shape[1] == 3 or not len(flat):
         out = vectors(flat)[:, :6]
     else:
-        out = np.column_stack([flat[:, :3, 3], Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()])
+        turns = Rotation.from_matrix(flat[:, :3, :3])
+        out = np.column_stack([flat[:, :3, 3], turns.as_rotvec()])
     return out.reshape(*T.shape[:-2], out.shape[1])
 
 

@@ -299,7 +299,9 @@ def test_ratio_over_drives():
     single = ratio_of(np.array([np.nan, 1.2]), np.array([1.0, 1.4, 1.1, 1.3] * 5))
     assert (single.drives, single.windows) == (1, 20)
     assert np.isnan(single.spread)
-    assert single.low < single.value == pytest.approx(1.2)
+    error = np.std([1.0, 1.4, 1.1, 1.3] * 5, ddof=1) / np.sqrt(20) / 1.2
+    assert single.value == pytest.approx(1.2)
+    assert np.log([single.value / single.low, single.high / single.value]) == pytest.approx(2.0930241 * error)
     assert np.isnan(ratio_of(np.array([np.nan]), np.array([])).value)
 
 

@@ -11,7 +11,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, matrices_of, motions_between
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
-from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.types import Array, Indices
 
 SHARED = 0.7  # correlation of two estimators' errors from which the truth's own are behind both

@@ -29,8 +29,15 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, with_factors
-from consistency.referee.fit_covariance.factors import Factors, Fit, blocks_of, fit_alone
-from consistency.referee.fit_covariance.floors import SAME, fit_runs, fit_with_floors
+from consistency.referee.fit_covariance.factors import (
+    SAME,
+    Factors,
+    Fit,
+    blocks_of,
+    fit_alone,
+    fit_runs,
+    fit_with_floors,
+)
 from consistency.referee.types import Array
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")

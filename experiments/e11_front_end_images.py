@@ -23,7 +23,8 @@ from consistency.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, diagonal_covariances
+from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
+from consistency.stereo.visual_odometry.resection import diagonal_covariances
 from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
 from consistency.vision import (
     RelativePose,

@@ -102,7 +102,7 @@ def monte_carlo_command(
     records, verdicts = run_study(program, plan, out, estimates, files, resume, overwrite)
     tell_notes(records)
     tell(failures_in_words(records, out))
-    shown = document(verdicts, out.name)
+    shown = document(verdicts, program.name)
     print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
     if not as_json:
         print_next("runs", out)

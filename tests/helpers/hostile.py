@@ -309,7 +309,7 @@ def _findings(folder: Path) -> None:
 
 def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
     def read(folder: Path) -> None:
-        from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
+        from consistency.stereo.frontend.camera_truth import find_truth, read_truth
         from consistency.stereo.visual_odometry.sequence import read_sequence
 
         sequence = read_sequence(folder, None if calibration is None else folder / calibration)

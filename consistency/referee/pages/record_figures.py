@@ -161,8 +161,8 @@ def errors_of(record: Record) -> list[Errors]:
     assert record.error is not None
     assert record.covariance is not None
     found = []
-    for i, name in enumerate(record.axes[:MOST_PANELS]):
-        unit, factor = unit_of(name)
+    for i, name in enumerate(record.names[:MOST_PANELS]):
+        unit, factor = unit_of(record.axes[i])
         bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, :, i, i], 0.0))
         found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
     return found
@@ -250,7 +250,7 @@ def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
         axes.axhline(0.0, **stroke(ZERO))
         curve(axes, clock.values, scaled[row], SHOWN, f"run {record.run_numbers[row]}")
         reach = max(LEAST_REACH, 1.1 * _most(scaled))
-        axes.set(ylabel=f"{record.axes[axis]} / sigma", ylim=(-reach, reach))
+        axes.set(ylabel=f"{record.names[axis]} / sigma", ylim=(-reach, reach))
         clock.name(axes)
 
     return paint
@@ -408,7 +408,7 @@ def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
         sigma = np.sqrt(np.diagonal(record.covariance, axis1=-2, axis2=-1))
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.abs(record.error) / sigma
-        for i, name in enumerate(record.axes[:MOST_PANELS]):
+        for i, name in enumerate(record.names[:MOST_PANELS]):
             found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
     if record.nees is not None and record.dof and not record.parts:
         found["all together"] = _shares(record.nees, distributions.chi2.ppf(p, record.dof))

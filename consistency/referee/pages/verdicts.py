@@ -20,7 +20,7 @@ STEP_1 = "A run that failed in step 1 has no estimates; a hang or a crash is cou
 
 def judgement(study: Judged) -> list[Block]:
     """Table and sentences of one study, and its failed runs."""
-    reasons = Reasons(tuple(reason(track.verdict, track.name, track.look) for track in study.tracks))
+    reasons = Reasons(tuple(reason(track.verdict, track.name, track.look, verbose=False) for track in study.tracks))
     view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
     cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
     label = f"Verdicts of {study.name}"

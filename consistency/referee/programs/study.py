@@ -176,7 +176,8 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
     reading = {name: str(value) if name in PATHS else value for name, value in given.items() if value is not None}
     here = program.here
     return {
-        "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
+        "program": program.name, "words": list(program.words),
+        "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
         "keep": plan.keep, "settings": {key: value for key, value in vars(plan.settings).items() if value is not None},

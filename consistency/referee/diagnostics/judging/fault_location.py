@@ -51,8 +51,8 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
         last = until(sample, band, detect)
     return Location(
         simultaneous=np.stack([band.low, band.high], axis=-1),
-        above=int(band.above.sum()),
-        below=int(band.below.sum()),
+        steps_above=int(band.above.sum()),
+        steps_below=int(band.below.sum()),
         first_outside=first_outside,
         first_step=first_step,
         since=since,

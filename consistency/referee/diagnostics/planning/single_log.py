@@ -204,7 +204,7 @@ def _require_steady(record: Record, P: Array) -> None:
     if min(map(len, blocks)) == 0:
         return
     medians = np.array([np.nanmedian(block, axis=0) for block in blocks])
-    names = record.axes or numbered_axes(medians.shape[1])
+    names = record.names or numbered_axes(medians.shape[1])
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
         signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]

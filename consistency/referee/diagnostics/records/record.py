@@ -85,6 +85,7 @@ class Record:
     optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
     failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
     axes: Sequence[str] = ()  # names of the n components, if they have any
+    own_names: Mapping[str, str] = field(default_factory=dict)  # of axes, what the user calls them, as a verdict does
     # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
     # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
     parts: tuple[tuple[int, ...], ...] = ()
@@ -140,6 +141,11 @@ class Record:
             return self.runs
         there = (self.error, self.nees, self.nis, self.innovations)
         return np.arange(next((len(array) for array in there if array is not None), 0))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What a verdict calls the axes: the user's own names where he has some."""
+        return tuple(self.own_names.get(axis, axis) for axis in self.axes)
 
     @property
     def in_world(self) -> Record:
@@ -213,7 +219,8 @@ class Record:
         return Record(
             self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
             self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            axes=self.axes, parts=self.parts, runs=number[there], unit="window", skipped=self.skipped,
+            axes=self.axes, own_names=self.own_names, parts=self.parts, runs=number[there], unit="window",
+            skipped=self.skipped,
             groups=None if self.groups is None else self.groups[there, None],
         )  # fmt: skip
 

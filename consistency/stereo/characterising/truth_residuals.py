@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,12 +30,17 @@ def octaves(d: Array) -> Array:
     """
     low, high = np.quantile(d, [ENDS, 1.0 - ENDS])
     if high < APART * low:
-        return np.array([float(np.median(d))])
-    powers = 2.0 ** np.arange(np.ceil(np.log2(low * APART)), np.floor(np.log2(high / APART)) + 1)
-    nodes = np.array([low, *powers, high])
-    while len(nodes) > 2 and (rows := hats(d, nodes).sum(axis=0)).min() < FEW:
+        return np.array([np.median(d)])
+    least = np.ceil(np.log2(low * APART))
+    most = np.floor(np.log2(high / APART))
+    nodes = np.array([low, *2.0 ** np.arange(least, most + 1), high])
+    rows = hats(d, nodes).sum(axis=0)
+    while len(nodes) > 2 and rows.min() < FEW:
         nodes = np.delete(nodes, np.clip(rows.argmin(), 1, len(nodes) - 2))
-    return nodes if hats(d, nodes).sum(axis=0).min() >= FEW else np.array([float(np.median(d))])
+        rows = hats(d, nodes).sum(axis=0)
+    if rows.min() < FEW:
+        return np.array([np.median(d)])
+    return nodes
 
 
 @dataclass(frozen=True)
@@ -72,28 +78,31 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
 
     What is ideal is Herath et al. (2007) eq. 22 at the true poses.
     """
-    parts, strange = list[Residuals](), 0
+    parts = []
+    strange = 0
     for number, trial in enumerate(trials):
         assert trial.truth is not None
         assert trial.landmarks is not None
-        real = trial.landmark < len(trial.landmarks)
-        strange += int((~real).sum())
-        step = trial.step[real]
-        landmark, z = trial.landmark[real], trial.z[real]
+        rows = np.lexsort((trial.step, trial.landmark))
+        rows = rows[trial.landmark[rows] < len(trial.landmarks)]
+        strange += len(trial.z) - len(rows)
+        step = trial.step[rows]
+        landmark = trial.landmark[rows]
         body = point.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
-        assert sensor.f is not None
-        assert sensor.B is not None
-        ideal = np.stack(stereo.project(*point.to_sensor(*body, sensor.mount.packed()), sensor.f, sensor.B), axis=-1)
-        order = np.lexsort((step, landmark))
-        moved = np.append(False, np.abs(np.diff(trial.truth, axis=0)).max(axis=1) > 0.0)
+        in_sensor = point.to_sensor(*body, sensor.mount.packed())
+        ideal = np.stack(stereo.project(*in_sensor, *sensor.rig), axis=-1)
         track = landmark + number * trial.n_landmarks
-        parts.append(Residuals(*(a[order] for a in (z - ideal, ideal, track, step, moved[step]))))
-    joined = [np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts), strict=True)]
-    return Residuals(*joined), strange
+        parts.append((trial.z[rows] - ideal, ideal, track, step, moved_before(trial.truth)[step]))
+    return Residuals(*map(np.concatenate, zip(*parts, strict=True))), strange
 
 
-@dataclass(frozen=True)
-class RowSelection:
+def moved_before(poses: Array) -> Array:
+    """Whether poses (T + 1, 3) differ from the one before, (T + 1,) of bool."""
+    moved = (np.diff(poses, axis=0) != 0.0).any(axis=1)
+    return np.append(False, moved)
+
+
+class RowSelection(NamedTuple):
     """The rows that the noise is estimated from, and the others."""
 
     kept: Residuals
@@ -112,13 +121,19 @@ def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSel
     ----------
     regressors : (N, p), of the bias map
     """
-    fits = [_robust(data.r[:, k], regressors) for k in range(3)]
-    centred = data.r - np.column_stack(fits)
-    scale = np.column_stack([_spread(centred[:, 0]), _spread(centred[:, 1]), _local_spread(centred[:, 2], data)])
-    rough = np.array([_spread(centred[:, k])[0] for k in range(3)])
-    inside = within_limits(data.ideal + np.column_stack(fits), MARGIN * scale, sensor)
+    fits = np.column_stack([_robust(column, regressors) for column in data.r.T])
+    centred = data.r - fits
+    rough = np.array([robust_sd(column) for column in centred.T])
+    scale = np.tile(rough, (len(data), 1))
+    scale[:, 2] = _local_spread(centred[:, 2], data)
+    inside = within_limits(data.ideal + fits, MARGIN * scale, sensor)
     gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
-    return RowSelection(data.keep(inside & ~gross), int(gross.sum()), int((~inside).sum()), rough)
+    return RowSelection(
+        data.keep(inside & ~gross),
+        gross=int(gross.sum()),
+        at_limits=int((~inside).sum()),
+        rough=rough,
+    )
 
 
 def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:
@@ -126,11 +141,14 @@ def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:
     inside = np.ones(len(place), bool)
     if sensor.disparity is not None:
         low, high = sensor.disparity
-        inside &= (place[:, 2] >= low + margin[..., 2]) & (place[:, 2] <= high - margin[..., 2])
+        inside &= place[:, 2] >= low + margin[..., 2]
+        inside &= place[:, 2] <= high - margin[..., 2]
     if sensor.image is not None:
-        for k, (size, middle) in enumerate(zip(sensor.image, sensor.centre, strict=True)):
+        for k in range(2):
             edge = margin[..., k]
-            inside &= (place[:, k] >= edge - middle) & (place[:, k] <= size - middle - edge)
+            middle = sensor.centre[k]
+            inside &= place[:, k] >= edge - middle
+            inside &= place[:, k] <= sensor.image[k] - middle - edge
     return inside
 
 
@@ -139,15 +157,16 @@ def _robust(r: Array, X: Array) -> Array:
     beta = np.full(X.shape[1], np.median(r))
     for _ in range(10):
         e = r - X @ beta
-        weight = np.minimum(1.0, HUBER * _spread(e) / np.maximum(np.abs(e), 1e-12))
+        limit = HUBER * robust_sd(e)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(e), 1e-12))
         normal = (X * weight[:, None]).T @ X + 1e-3 * np.eye(X.shape[1])
         beta = np.linalg.solve(normal, X.T @ (weight * r))
-    return np.asarray(X @ beta)
+    return X @ beta
 
 
-def _spread(e: Array) -> Array:
-    """Robust standard deviation of a sample, at each of its members (N,)."""
-    return np.full(len(e), max(MAD * float(np.median(np.abs(e - np.median(e)))), 1e-9))
+def robust_sd(e: Array) -> float:
+    """Robust standard deviation of a sample."""
+    return max(MAD * np.median(np.abs(e - np.median(e))), 1e-9)
 
 
 def _local_spread(e: Array, data: Residuals) -> Array:
@@ -155,9 +174,9 @@ def _local_spread(e: Array, data: Residuals) -> Array:
     d = np.maximum(data.ideal[:, 2], 1e-3)
     nodes = octaves(d)
     nearest = hats(d, nodes).argmax(axis=1)
-    out = _spread(e)
+    out = np.full(len(e), robust_sd(e))
     for node in range(len(nodes)):
         own = nearest == node
         if own.sum() >= FEW:
-            out[own] = _spread(e[own])[0]
+            out[own] = robust_sd(e[own])
     return out

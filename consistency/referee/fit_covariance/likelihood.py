@@ -1,4 +1,4 @@
-"""Maximum likelihood of the covariances of errors, by scoring."""
+"""Maximum likelihood of the covariances of Gaussian errors, by scoring."""
 
 from __future__ import annotations
 
@@ -19,6 +19,16 @@ class Score(NamedTuple):
     value: float
     gradient: Array  # (p,)
     information: Array  # (p, p), expected
+
+
+def nees_of(error: Array, C: Array) -> Array:
+    """e' C^-1 e of errors (K, n) and covariances (K, n, n), (K,)."""
+    return np.asarray((error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1))
+
+
+def log_densities(error: Array, C: Array) -> Array:
+    """Log density of each error (K, n) with its covariance (K, n, n), (K,)."""
+    return np.asarray(-0.5 * (nees_of(error, C) + np.linalg.slogdet(2.0 * np.pi * C)[1]))
 
 
 def score_of(error: Array, C: Array, F: Array) -> Score:

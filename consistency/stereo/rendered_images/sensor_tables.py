@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, bilinear, hats
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 from consistency.stereo.rendered_images.chain import Tracks
 
 ROUNDS = 30  # of the fit of the growth, which settles in a few
@@ -38,7 +38,7 @@ class Growth:
     @property
     def standard_error(self) -> Array:
         """Of ``sd``, (K,), px."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
     def table(self, sigma: float) -> DisparityGrowth:
         """The growth as a scenario has it, over a sensor's own ``sigma`` of disparity in px."""
@@ -77,13 +77,18 @@ def track_means(tracks: Tracks, fewest: int = FEWEST) -> TrackMeans:
     if not long.any():
         raise InputError(f"tracks: none has {fewest} observations; track through more images")
 
-    def mean(values: Array) -> Array:
-        sums = [np.bincount(number, weights=column) for column in values.T]
-        return np.stack(sums, axis=-1) / count[:, None]
+    errors = _means(tracks.errors, number, count)
+    scatter = _means((tracks.errors - errors[number]) ** 2, number, count)
+    scatter *= (count / np.maximum(count - 1, 1))[:, None]
+    truth = _means(tracks.truth, number, count)
+    return TrackMeans(truth[long], errors[long], scatter[long], count[long])
 
-    errors = mean(tracks.errors)
-    scatter = mean((tracks.errors - errors[number]) ** 2) * (count / np.maximum(count - 1, 1))[:, None]
-    return TrackMeans(mean(tracks.truth)[long], errors[long], scatter[long], count[long])
+
+def _means(values: Array, number: Indices, count: Indices) -> Array:
+    """Means (n, 3) over tracks of values (M, 3) of the tracks ``number`` (M,)."""
+    sums = np.zeros((len(count), values.shape[1]))
+    np.add.at(sums, number, values)
+    return sums / count[:, None]
 
 
 def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
@@ -105,14 +110,16 @@ def disparity_growth(means: TrackMeans, nodes: Array) -> Growth:
     nodes = _increasing(nodes)
     H = hats(means.truth[:, 2], nodes)
     _require_support(H, [f"disparity {node:g} px" for node in nodes])
-    s2, dof = means.variance[:, 2], means.count - 1.0
+    s2 = means.variance[:, 2]
+    dof = means.count - 1.0
     theta = np.full(len(nodes), np.sqrt(np.average(s2, weights=dof)))
     floor = 1e-3 * theta[0]
     for _ in range(ROUNDS):
         sd = H @ theta
         weight = 2.0 * dof / sd**2  # information of s^2 on sd
         step = (s2 - sd**2) / (2.0 * sd)
-        theta = np.maximum(theta + np.linalg.solve(H.T @ (weight[:, None] * H), H.T @ (weight * step)), floor)
+        information = H.T @ (weight[:, None] * H)
+        theta = np.maximum(theta + np.linalg.solve(information, H.T @ (weight * step)), floor)
     sd = H @ theta
     information = H.T @ ((2.0 * dof / sd**2)[:, None] * H)
     excess = 0.5 * dof * (s2 / sd**2 - 1.0) ** 2
@@ -132,7 +139,8 @@ def bias_map(means: TrackMeans, u: Array, v: Array) -> Biases:
     InputError
         A node has no track near it, or there are fewer tracks than nodes.
     """
-    u, v = _increasing(u), _increasing(v)
+    u = _increasing(u)
+    v = _increasing(v)
     H = bilinear(means.truth[:, 0], means.truth[:, 1], u, v)
     _require_support(H, [f"u = {x:g}, v = {y:g} px" for y in v for x in u])
     inverse = np.linalg.inv(H.T @ H)

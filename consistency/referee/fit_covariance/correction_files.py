@@ -12,6 +12,7 @@ from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
+from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.page import correction_page
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
@@ -95,19 +96,16 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
     rows = np.flatnonzero(np.isin(record.run_numbers, list(of_runs)))
     some = record.of_runs(rows)
     used = [of_runs[run] for run in some.run_numbers.tolist()]
-    corrected = with_factors(some, used)
-    assert corrected.nees is not None
-    assert corrected.error is not None
-    assert corrected.covariance is not None
-    counted = np.isfinite(corrected.nees)
+    error, P, nees = stated_errors(with_factors(some, used))
+    counted = np.isfinite(nees)
     mask = ~counted
-    for failure in corrected.failures:  # which stay failures
-        mask[corrected.run_numbers == failure.run, failure.step - 1 :] = False
+    for failure in some.failures:  # which stay failures
+        mask[some.run_numbers == failure.run, failure.step - 1 :] = False
     axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
     np.savez(
         path,
-        errors=corrected.error,
-        covariances=np.where(counted[..., None, None], corrected.covariance, np.eye(record.dof)),
+        errors=error,
+        covariances=np.where(counted[..., None, None], P, np.eye(record.dof)),
         mask=mask,
         axes=axes,
     )

@@ -218,7 +218,8 @@ def rotation_growth(windows: DriveWindows, mean: Mean) -> RotationGrowth:
         return RotationGrowth(float("nan"), float("nan"))
     spans = np.log(LONGER[: len(squares)])
     sizes = np.log(np.maximum(squares, 1e-300))
-    (power, _), covariance = np.polyfit(spans, sizes, 1, w=np.sqrt(0.5 * np.array(counts)), cov="unscaled")
+    weights = np.sqrt(0.5 * np.array(counts))
+    (power, _), covariance = np.polyfit(spans, sizes, 1, w=weights, cov="unscaled")
     return RotationGrowth(float(power), float(np.sqrt(2.0 * covariance[0, 0])))
 
 

@@ -34,7 +34,7 @@ from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, Driv
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.refusals import doubts, require_sound, rotation_growth
 from consistency.referee.fit_covariance.white_noise import fit_noise, terms_of, variance_intervals
-from consistency.referee.geometry.groups import composed, matrices, vectors
+from consistency.referee.geometry.lie_groups import composed, matrices, vectors
 from consistency.referee.types import Array
 
 SPAN, STEP, LENGTH = "10m", 0.5, 1000.0  # m

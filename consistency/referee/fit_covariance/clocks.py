@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import inverse, log, matrices
+from consistency.referee.geometry.lie_groups import inverse, log, matrices
 from consistency.referee.readers.clock_offset import GRID, MOST, REACH, refined
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array

@@ -33,7 +33,7 @@ from consistency.referee.fit_covariance.intervals import mean_over_runs
 from consistency.referee.fit_covariance.likelihood import log_densities
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 LEVELS = (0.68, 0.95, 0.99)
 ByGroup = tuple[Factors, ...]  # of each group, and last of all steps

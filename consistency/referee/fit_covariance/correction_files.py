@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
-from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.geometry.lie_groups import composed, matrices
 from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,

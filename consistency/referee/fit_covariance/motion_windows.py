@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.geometry.groups import inverse, log, matrices, vectors
+from consistency.referee.geometry.lie_groups import inverse, log, matrices, vectors
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array, Indices
 

@@ -52,7 +52,7 @@ from consistency.referee.fit_covariance.refusals import (
 )
 from consistency.referee.fit_covariance.second_estimator import SecondErrors, errors_of_second
 from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
-from consistency.referee.geometry.groups import log, matrices
+from consistency.referee.geometry.lie_groups import log, matrices
 from consistency.referee.readers.pipeline.relative_motions import Stretch
 from consistency.referee.types import Array
 

@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.model_text import noise_document
 from consistency.referee.fit_covariance.motion_windows import mean_square, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
 from consistency.referee.pages.trajectory import ellipse
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     canvas,
     curve,
     dots,

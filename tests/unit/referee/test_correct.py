@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError

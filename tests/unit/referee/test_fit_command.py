@@ -30,7 +30,7 @@ from consistency.referee.fit_covariance.writing import (
     straight,
     write_model,
 )
-from consistency.referee.geometry.groups import composed, vectors
+from consistency.referee.geometry.lie_groups import composed, vectors
 from consistency.referee.readers.options import Reading
 
 SPAN = "10m"

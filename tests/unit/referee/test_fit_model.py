@@ -40,7 +40,7 @@ from consistency.referee.fit_covariance.white_noise import (
     jitter_of,
     terms_of,
 )
-from consistency.referee.geometry.groups import composed, inverse, log, vectors
+from consistency.referee.geometry.lie_groups import composed, inverse, log, vectors
 
 GROUPS = ("SE(2)", "SE(3)")
 

@@ -28,7 +28,7 @@ from consistency.referee.fit_covariance.refusals import require_poses
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.fit_covariance.writing import snippets
-from consistency.referee.geometry.groups import composed, inverse, vectors
+from consistency.referee.geometry.lie_groups import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses, unstated

@@ -33,7 +33,7 @@ from consistency.referee.fit_covariance.intervals import mean_over_runs
 from consistency.referee.fit_covariance.likelihood import log_densities
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.judge_sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all, source_of
 
 LEVELS = (0.68, 0.95, 0.99)
 ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
@@ -210,13 +210,13 @@ def the_record(records: Sequence[Record], name: str | None = None) -> Record:
     InputError
         There are several, or none of this name.
     """
-    found = [record for record in records if name in (None, record.name)]
-    if len(found) == 1:
-        return found[0]
-    what = "these files hold several estimators: name one by --filter"
+    source = source_of(records)
     if name is not None:
-        what = f"--filter {name}: is not in these files"
-    raise InputError(f"{what}; there are: {', '.join(record.name for record in records)}")
+        return source.record(name)
+    if len(source.filters) > 1:
+        there = ", ".join(source.filters)
+        raise InputError(f"these files hold several estimators: name one by --filter; there are: {there}")
+    return records[0]
 
 
 def require_runs(record: Record) -> None:

@@ -123,6 +123,7 @@ def pasted(found: Correction) -> str:
         place = f'FACTORS[f"{groups.column} is {{value}}"]'
         if groups.edges is not None:
             place = f"list(FACTORS.values())[bisect.bisect_left({list(groups.edges)}, value)]"
+    table = "".join(f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items())
     turn = "heading" if "heading" in found.axes else "yaw"
     order = ("x", "y", turn) if turn == "heading" else ("roll", "pitch", "yaw", "x", "y", "z")  # of Pose2, or Pose3
     return f'''"""Corrected covariances. {sentence(found)}."""
@@ -133,7 +134,7 @@ AXES = {found.axes}
 ROS = ("x", "y", "z", "roll", "pitch", "{turn}")
 GTSAM = {order}
 FACTORS = {{  # factor and floor on the variance of each component
-{_table_of_factors(found)}}}
+{table}}}
 
 
 def corrected(P{value}, axes=AXES):
@@ -161,9 +162,3 @@ def gtsam_noise(P{value}):
 
     return gtsam.noiseModel.Gaussian.Covariance(corrected(P{value}, axes=GTSAM))
 '''
-
-
-def _table_of_factors(found: Correction) -> str:
-    """Lines of the table of factors and floors by group and component."""
-    lines = [f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items()]
-    return "".join(lines)

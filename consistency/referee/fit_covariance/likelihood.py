@@ -52,7 +52,12 @@ def score_of(error: Array, C: Array, F: Array) -> Score:
     return Score(value, gradient, information)
 
 
-def maximise(score: Callable[[Array], Score], theta: Array, least: Array | float, close: float) -> Array:
+def maximise(
+    score: Callable[[Array], Score],
+    theta: Array,
+    least: Array | float,
+    close: float,
+) -> Array:
     """Parameters (p,) of at least ``least``, at least 0, with the largest likelihood.
 
     Each step solves the equations of the score with theta >= 0 (Lawson & Hanson 1974), and is halved until the

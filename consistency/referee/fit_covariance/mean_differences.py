@@ -100,7 +100,12 @@ def bins_of(sizes: Array) -> Indices:
     return np.searchsorted(edges, sizes, side="right")
 
 
-def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(
+    windows: DriveWindows,
+    pieces: Array,
+    bins: Indices,
+    scale: int,
+) -> float:
     """p-value of a scale that grows from bin to bin, by a score test of errors of windows, beside motions in pieces.
 
     Each drive has constants of its own. The scores of blocks of windows are compared with their scatter (Student's t).

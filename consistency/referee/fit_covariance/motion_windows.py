@@ -109,7 +109,12 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
+def cut_windows(
+    drives: Sequence[Drive],
+    span: Relative,
+    planar: bool = False,
+    pieces: int = PIECES,
+) -> DriveWindows:
     """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
@@ -200,7 +205,12 @@ def _jumps(of: DriveWindows) -> Array:
 # --- motions as vectors -----------------------------------------------------------------------------------------------
 
 
-def motions_between(T: Array, first: Indices, last: Indices, planar: bool = False) -> Array:
+def motions_between(
+    T: Array,
+    first: Indices,
+    last: Indices,
+    planar: bool = False,
+) -> Array:
     """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first, (..., n)."""
     motions = inverse(T[first]) @ T[last]
     if planar and T.shape[-1] == 4:

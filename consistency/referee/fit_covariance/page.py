@@ -46,7 +46,12 @@ MANY = 2000  # errors of motions that are drawn
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
-def page_of(said: Document, title: str, caption: str, draw: Callable[[], Drawing]) -> Document:
+def page_of(
+    said: Document,
+    title: str,
+    caption: str,
+    draw: Callable[[], Drawing],
+) -> Document:
     """A document with its picture."""
     picture = Figure(title, caption, (draw,))
     return replace(said, chapters=(Chapter("", "", "", (picture,)),))
@@ -94,7 +99,12 @@ def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
     axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 
 
-def _draw_growth(panel: Axes, model: NoiseModel, axes: Sequence[int], unit: str) -> None:
+def _draw_growth(
+    panel: Axes,
+    model: NoiseModel,
+    axes: Sequence[int],
+    unit: str,
+) -> None:
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([mean_square(windows.errors) for windows in found])

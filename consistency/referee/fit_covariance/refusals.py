@@ -75,7 +75,13 @@ def require_poses(drives: Sequence[Drive]) -> None:
         _require_poses(drive.name, "truth", drive.truth, drive.estimate, "compound them to poses")
 
 
-def _require_poses(drive: str, name: str, T: Array, other: Array, remedy: str) -> None:
+def _require_poses(
+    drive: str,
+    name: str,
+    T: Array,
+    other: Array,
+    remedy: str,
+) -> None:
     if _are_placeholders(T, other):
         raise InputError(
             f"{drive}: all rows of the {name} have one orientation, though the path turns: it is a placeholder, as "

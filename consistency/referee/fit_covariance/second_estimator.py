@@ -16,7 +16,7 @@ from consistency.referee.fit_covariance.motion_windows import (
     root_mean_square,
 )
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
-from consistency.referee.geometry.groups import inverse, log
+from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.types import Array, Indices
 
 SHARED = 0.7  # correlation of two estimators' errors from which the truth's own are behind both

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError

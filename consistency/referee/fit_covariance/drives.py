@@ -16,7 +16,6 @@ from consistency.referee.readers.formats.file_kinds import (
     TABLES,
     TRAJECTORIES,
     is_bag,
-    is_drive,
     is_plane,
     is_solution,
     trajectory_files,
@@ -26,6 +25,7 @@ from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import Found, kind_of
+from consistency.referee.readers.pipeline.run_folders import truth_of
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array, Indices
@@ -143,13 +143,9 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
     for path in files:
-        truth = r.truth
-        if truth is not None and truth.is_dir() and not is_drive(truth):
-            truth = truth / path.name
-        if truth is not None and not truth.exists():
-            raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
+        own = replace(r, truth=truth_of(path, r.truth))
         stem = path.name.split(".")[0]
-        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True), r):
+        for poses in _of_one(path, read_tables(path, own, poses_alone=True), r):
             found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
     return found
 

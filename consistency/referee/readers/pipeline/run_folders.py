@@ -8,7 +8,7 @@ from pathlib import Path
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.file_kinds import table_files
+from consistency.referee.readers.formats.file_kinds import is_drive, table_files
 from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import Estimator, Poses
@@ -24,19 +24,24 @@ def read_table_folder(folder: Path, r: Reading, poses_alone: bool = False) -> li
     """
     found = {}
     for run, file in enumerate(table_files(folder)):
-        truth = r.truth
-        if truth is not None and truth.is_dir():
-            truth = _same_stem(truth, file)
-        found[run] = read_tables(file, replace(r, truth=truth), poses_alone)
+        found[run] = read_tables(file, replace(r, truth=truth_of(file, r.truth)), poses_alone)
     return merged(found, folder.stem)
 
 
-def _same_stem(folder: Path, file: Path) -> Path:
-    """The table of a folder for the run of another one."""
-    for other in table_files(folder):
-        if other.stem == file.stem:
+def truth_of(file: Path, truth: Path | None) -> Path | None:
+    """The truth of one run, the table of the same stem where ``truth`` is a folder of them.
+
+    Raises
+    ------
+    InputError
+        The folder has none.
+    """
+    if truth is None or not truth.is_dir() or is_drive(truth):
+        return truth
+    for other in (*table_files(truth), truth / file.name):
+        if other.stem == file.stem and other.exists():
             return other
-    raise InputError(f"--truth {folder}: holds no table '{file.stem}' for {file}")
+    raise InputError(f"--truth {truth}: holds no table '{file.stem}' for {file}")
 
 
 def merged(

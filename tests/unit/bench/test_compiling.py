@@ -5,7 +5,6 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +20,6 @@ from consistency.bench.runs.findings import experiments
 from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import load_scenario
 
-Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
 SCRIPT = """
 import multiprocessing, os, resource, signal, sys, time

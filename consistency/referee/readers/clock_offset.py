@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ MOST = 4000  # estimates that are looked at, of all runs together
 PARTS = 12  # that a single run is cut into
 CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts no more: a broken one decides nothing
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
+SHIFTS = np.geomspace(0.004, REACH, 12)
+GRID = np.concatenate([-SHIFTS[::-1], [0.0], SHIFTS])  # s, offsets of which the best is refined
 ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
 RATE = 1e-4  # probability that an offset is named where there is none
 SHOWN = 5e-4  # probability that a right filter's estimates show an offset of the sign that is looked for
@@ -88,17 +90,10 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     def size(shift: float) -> float:
         return float(np.mean([_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]))
 
-    steps = np.geomspace(0.004, REACH, 12)
-    grid = np.concatenate([-steps[::-1], [0.0], steps])
-    sizes = np.array([size(shift) for shift in grid])
+    sizes = np.array([size(shift) for shift in GRID])
     if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9 or not size(0.0) > 0.0:
         return None  # nothing moves, or no error is there to explain
-    best = int(np.nanargmin(sizes))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})
-    value = float(grid[best])
-    if found.fun < sizes[best]:
-        value = float(found.x)
+    value = refined(size, sizes, 1e-5)
     each = np.concatenate([steps_of(poses, value, 1 if len(some) > 1 else PARTS) for poses in some])
     each = value + each[np.isfinite(each)]
     if len(each) < 3:
@@ -110,6 +105,14 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
         p = 2.0 * float(distributions.t.sf(abs(each.mean()) / spread, len(each) - 1))
     alone = len(some) == 1 and not (size(0.0) > GROSS and size(value) < 0.5 * size(0.0))
     return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
+
+
+def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> float:
+    """The offset with the smallest size, near the best one of ``GRID``, with ``sizes`` there."""
+    best = int(np.nanargmin(sizes))
+    bounds = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
+    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return float(found.x if found.fun < sizes[best] else GRID[best])
 
 
 def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:

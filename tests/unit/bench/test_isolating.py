@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -19,12 +20,13 @@ from numpy.testing import assert_array_equal
 from threadpoolctl import threadpool_info
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
-from consistency.bench.runs.gather import Gathered
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.isolation import filter_process
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.store.trial_rows import outcome_of
+from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.runs.run_outcome import outcome_of
+from consistency.bench.store.journal import IN_MEMORY, Journal
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # no process of a filter imports all of this, for seconds
@@ -211,11 +213,12 @@ def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world, doomed):
         whole, cut = (
             (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
         )
-    gathered = Gathered(["bad"], {})
-    gathered.add(outcome_of(*whole))
-    with pytest.raises(KeyboardInterrupt):
-        gathered.add(replace(outcome_of(*cut), maps=Cut()))
-    results = gathered.results({"filters": ["bad"]}, None)
+    with closing(Journal(IN_MEMORY)) as journal:
+        gathered = Gathered(["bad"], {}, journal)
+        gathered.add(outcome_of(*whole))
+        with pytest.raises(KeyboardInterrupt):
+            gathered.add(replace(outcome_of(*cut), maps=Cut()))
+        results = gathered.results({"filters": ["bad"]}, None)
     assert results.estimates["run"].unique().tolist() == [DOOMED]
     assert results.truth["run"].unique().tolist() == [DOOMED]
     assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +22,7 @@ from consistency.referee.readers.formats.file_kinds import (
 )
 from consistency.referee.readers.formats.named_columns import DEVIATIONS, roles_of
 from consistency.referee.readers.formats.other_names import covariance_places
-from consistency.referee.readers.formats.pose_covariances import ORDERS, covariance_order
+from consistency.referee.readers.formats.pose_covariances import ORDERS, components_in, covariance_order
 from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS as SIZES
 from consistency.referee.readers.formats.pose_rows import POSE as POSE_COLUMNS
@@ -34,9 +32,8 @@ from consistency.referee.readers.formats.tum import files_of_runs
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE
 
-Change = Callable[
-    [int, str], Mapping[str, tuple[float, float]] | None
-]  # by run and value of --by: of components; or None
+Change = Callable[[int, str], Mapping[str, tuple[float, float]] | None]  # run, value of --by: factors of components
+QUOTED = r'(?=(?:[^"]*"[^"]*")*[^"]*$)'  # a place with an even number of quotes after it
 
 
 @dataclass(frozen=True)
@@ -61,41 +58,47 @@ class TextFile:
         return "".join([*lines[:first], *(self._line(line, change) for line in lines[first:])])
 
     def _line(self, line: str, change: Change) -> str:
-        if not line.strip() or line.lstrip().startswith("#"):
-            return line
-        separator = max(",;\t", key=line.count)
+        """A line with its covariance restated, and no other change; "" where its run or estimator is left out."""
         text = line.rstrip("\r\n")
-        end = line[len(text) :]
-        if separator not in line:  # white space, which stays as it is
-            parts = re.split(r"(\s+)", text.strip())
-            parts[::2] = fields = self._restated(parts[::2], change)
-            return "".join(parts) + end if fields else ""
-        fields = next(csv.reader([text], delimiter=separator, skipinitialspace=True))
-        restated = self._restated(fields, change)
-        out = io.StringIO()
-        csv.writer(out, delimiter=separator, lineterminator="").writerow(restated)
-        return out.getvalue() + end if restated else ""
+        separator = max(",;\t", key=text.count)
+        between = re.escape(separator)
+        if separator not in text:
+            text = text.strip()
+            between = r"\s+"
+        if not text.strip() or text.lstrip().startswith("#"):
+            return line
+        if '"' in text:  # a separator between quotes is none
+            between += QUOTED
+        parts = re.split(f"({between})", text)
+        restated = self._restated(parts[::2], change)
+        if not restated:
+            return ""
+        parts[::2] = restated
+        return line.replace(text, "".join(parts), 1)
 
     def _restated(self, fields: list[str], change: Change) -> list[str]:
         """Fields of a line with its covariance restated; none where its run or estimator is left out."""
-        if self.filter_column is not None and fields[self.filter_column].strip() != self.filter:
+        bare = [field.strip(' "') for field in fields]
+        if self.filter_column is not None and bare[self.filter_column] != self.filter:
             return []
-        run = self.run if self.run_column is None else int(float(fields[self.run_column]))
-        of = change(run, "" if self.by_column is None else fields[self.by_column])
+        run = self.run if self.run_column is None else int(float(bare[self.run_column]))
+        of = change(run, "" if self.by_column is None else bare[self.by_column])
         if of is None:
             return []
-        fields = list(fields)
+        out = list(fields)
         for column, (a, b) in self.entries.items():
-            if not fields[column].strip():
+            if not bare[column]:
                 continue
-            value = float(fields[column])
+            value = float(bare[column])
             (factor, floor), (other, _) = of.get(a, (1.0, 0.0)), of.get(b, (1.0, 0.0))
             if not self.squared:
-                value = float(np.sqrt(factor * value * value + floor))
+                value = float(np.sqrt(factor * value**2 + floor))
             else:
-                value = value * float(np.sqrt(factor * other)) + (floor if a == b else 0.0)
-            fields[column] = repr(value)
-        return fields
+                value *= float(np.sqrt(factor * other))
+                if a == b:
+                    value += floor
+            out[column] = repr(value)
+        return out
 
 
 def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
@@ -186,7 +189,7 @@ def _width(path: Path) -> int:
 def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, squared: bool) -> TextFile | None:
     """A file with n^2 numbers of a covariance in a row, its upper triangle, or n of a diagonal, n = 6, 9 or 15."""
     many = len(columns)
-    n = next((n for n in SIZES if many in (n, n * n, n * (n + 1) // 2)), None)
+    n = components_in(many)
     if n is None:
         return None
     order = covariance_order(n, r.covariance_order or ORDERS[0])

@@ -18,7 +18,7 @@ from consistency.referee.readers.formats.file_head import begins_with_numbers, h
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.named_columns import naming
 from consistency.referee.readers.formats.other_names import (
-    require_true_columns,
+    missing_truth,
     true_columns,
     with_clock,
     with_known_names,
@@ -81,8 +81,11 @@ def _both(
             truth = with_clock(truth)
     if truth is None:
         truth = true_columns(sheet, axes)
+        missing = missing_truth(sheet, axes)
         if truth is not None:
             notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
+        elif missing:
+            notes.append(f"{sheet.path}: only the NIS is read, because the truth cannot be used: {missing}")
     return sheet, truth, [note for note in notes if note]
 
 
@@ -154,7 +157,9 @@ def _require_truth(
         state = ""
         if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
-        require_true_columns(sheet, axes)
+        missing = missing_truth(sheet, axes)
+        if missing:
+            raise InputError(f"{sheet.path}: {missing}")
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")

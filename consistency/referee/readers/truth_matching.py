@@ -140,6 +140,10 @@ def _bends(position: Array, after: Indices) -> Array:
     return np.asarray(np.maximum(before, behind) / 8.0)
 
 
+OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend")
+OF_TRUTH = ("true_t", "truth", "true_clock", "true_covariance")
+
+
 @dataclass(frozen=True)
 class Poses:
     """One run; N estimates and M samples of the truth.
@@ -187,9 +191,14 @@ class Poses:
         if P is not None:
             P = P[nearest(found.t + shift, self.true_t, known.before)]
         return replace(
-            found, true_t=found.t, truth=known.truth, true_covariance=P, true_clock=at(self.true_clock, known.before),
-            apart=known.apart, bend=known.bend,
-        )  # fmt: skip
+            found,
+            true_t=found.t,
+            truth=known.truth,
+            true_covariance=P,
+            true_clock=at(self.true_clock, known.before),
+            apart=known.apart,
+            bend=known.bend,
+        )
 
     def pairs(self, kept: Array) -> Poses:
         """Some of the estimates, by truth values or indices, with the truth beside each of them."""
@@ -197,7 +206,7 @@ class Poses:
         if len(rows) == len(self.t):
             return self
         found = self.of_rows(rows).beside(rows)
-        return replace(found, true_t=found.t, apart=at(self.apart, rows), bend=at(self.bend, rows))
+        return replace(found, true_t=found.t)
 
     def errors(self, shift: float = 0.0) -> Array:
         """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
@@ -218,6 +227,11 @@ class Poses:
             from consistency.referee.geometry.groups import state_error as error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
+
+    @property
+    def d(self) -> int:
+        """2 in the plane, 3 in space."""
+        return 2 if self.covariance.shape[-1] == 3 else 3
 
     @property
     def seconds(self) -> Array:
@@ -256,18 +270,14 @@ class Poses:
         """Some of the estimates beside all of the truth."""
         if len(rows) == len(self.t):
             return self
-        return replace(
-            self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
-            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows), by=at(self.by, rows),
-        )  # fmt: skip
+        return replace(self, place=self.place.at(rows), **self._rows_of(OF_ESTIMATES, rows))
 
     def beside(self, samples: Indices) -> Poses:
         """The estimates beside some samples of the truth."""
-        return replace(
-            self, true_t=self.true_t[samples], truth=self.truth[samples], true_clock=at(self.true_clock, samples),
-            true_covariance=at(self.true_covariance, samples),
-        )  # fmt: skip
+        return replace(self, **self._rows_of(OF_TRUTH, samples))
+
+    def _rows_of(self, names: Sequence[str], rows: Indices) -> dict[str, Any]:
+        return {name: at(getattr(self, name), rows) for name in names}
 
 
 Change = Callable[[Poses], Poses]  # what is read otherwise

@@ -126,7 +126,7 @@ def test_a_window_over_missing_rows_is_left_out():
 def test_rows_without_truth_change_no_other_window(rng):
     stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
     there = np.delete(np.arange(13), 3)
-    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
+    whole, some = windows_of(stretch, size), windows_of(stretch.beside(there), size)
     same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.track.t[:, None] == some.track.t))
     assert len(here) >= 4
     assert_array_equal(some.error[here], whole.error[same])

@@ -32,8 +32,6 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
     if not is_file(path):
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     if path.suffix.lower() == ".mat":
-        from consistency.referee.readers.formats.matlab_file import load_matlab
-
         return load_matlab(path)
     with path.open("rb") as file:
         what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
@@ -184,3 +182,44 @@ def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
     if found != (needed[1], needed[0], *needed[2:]):
         return ""
     return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"
+
+
+# --- files of MATLAB ---------------------------------------------------------------------------------
+
+
+HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
+
+
+def load_matlab(path: Path) -> dict[str, Array]:
+    """Arrays by name. MATLAB drops a last dimension of 1, which a single component has: it is restored."""
+    from scipy.io import loadmat, whosmat
+
+    with reading(path), path.open("rb") as file:
+        if file.read(len(HDF5)) == HDF5:
+            raise InputError(f"{path}: is of MATLAB 7.3; write it with save(..., '-v7')")
+    with reading(path):
+        require_room(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)))
+        arrays = {key: _array(key, value) for key, value in loadmat(path).items() if not key.startswith("__")}
+    P = arrays.get("covariances")
+    if P is None or P.ndim > 2:
+        return arrays
+    if P.shape[1] == 1:
+        raise InputError(f"{path}: key 'covariances' has shape {P.shape}: one run of one component has (1, steps)")
+    arrays["covariances"] = P[..., None, None]
+    for key in {"errors", "estimates", "truth"} & set(arrays):
+        arrays[key] = arrays[key][..., None]
+    return arrays
+
+
+def _array(key: str, value: object) -> Array:
+    """An array of a key; MATLAB has no fewer than two dimensions, no truth values, and texts in a cell."""
+    array = np.asarray(value)
+    if key in ("t", "lengths"):
+        return array.ravel()
+    if key == "dof":
+        return array.squeeze()
+    if key == "mask":
+        return np.asarray(array != 0)
+    if key == "axes":
+        return np.array([str(np.squeeze(each)) for each in array.ravel()])
+    return array

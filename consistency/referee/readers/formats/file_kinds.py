@@ -6,20 +6,17 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.columns import pose_columns, rates_in, state_columns
 from consistency.referee.readers.formats.file_head import beginning, begins_with_numbers, head_of
-from consistency.referee.readers.formats.named_columns import clock_of, places_of, roles_of
+from consistency.referee.readers.formats.spellings import PLAIN, Columns, clock_of
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
 HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
-SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
-TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
-HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
-PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
 
 
 def is_bag(path: Path) -> bool:
@@ -54,8 +51,8 @@ def is_poses(path: Path, columns: Columns | None = None) -> bool:
     head = head_of(path, columns)
     if head is None:
         return begins_with_numbers(path)
-    roles = roles_of(head.names, path)
-    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
+    found = pose_columns(head.names, path)
+    return "heading" not in head.names and found is not None and bool(found.quaternion)
 
 
 def is_plane(path: Path, columns: Columns | None = None) -> bool:
@@ -63,7 +60,7 @@ def is_plane(path: Path, columns: Columns | None = None) -> bool:
     head = head_of(path, columns)
     if head is None or clock_of(head.names) is None or is_poses(path, columns):
         return False
-    return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
+    return len(state_columns(head.names, POSE, PLAIN)) == len(POSE) or bool(rates_in(head.names))
 
 
 def trajectory_files(folder: Path, columns: Columns | None = None) -> list[Path]:

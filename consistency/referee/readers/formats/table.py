@@ -8,27 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.column_names import POSE as POSE_NAMES
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns
-from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.columns import covariance_columns
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
-from consistency.referee.readers.formats.named_columns import naming
-from consistency.referee.readers.formats.other_names import (
-    require_true_columns,
-    true_columns,
-    with_clock,
-    with_known_names,
-)
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.table_columns import POSE
+from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
 from consistency.referee.types import Array
+
+POSE = tuple(POSE_NAMES)
 
 
 def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = False) -> list[Estimator]:
@@ -56,7 +52,7 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
         of_filters = {name: sheet.rows(filters == name) for name in dict.fromkeys(filters)}
     found = []
     for name, own in of_filters.items():
-        true = truth if r.truth is not None else true_columns(own, axes)
+        true = truth if r.truth is not None else columns.true_columns(own, axes)
         if true is None:
             found.append(_innovations(name, own, key, axes))
         else:
@@ -76,11 +72,11 @@ def _both(
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     by_step = "step" in sheet and (truth is None or "step" in truth)
     if not by_step or r.time_offset is not None or r.max_dt is not None:
-        sheet = with_clock(sheet)
+        sheet = columns.with_clock(sheet)
         if truth is not None:
-            truth = with_clock(truth)
+            truth = columns.with_clock(truth)
     if truth is None:
-        truth = true_columns(sheet, axes)
+        truth = columns.true_columns(sheet, axes)
         if truth is not None:
             notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
     return sheet, truth, [note for note in notes if note]
@@ -105,7 +101,7 @@ def _sheet(
         sheet, note = planar_sheet(table, motions, renaming)
     else:
         sheet = read_sheet(table, renaming)
-    sheet, taken = with_known_names(sheet, axes)
+    sheet, taken = columns.with_known_names(sheet, axes)
     return sheet, "; ".join(filter(None, (note, taken)))
 
 
@@ -154,7 +150,7 @@ def _require_truth(
         state = ""
         if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
-        require_true_columns(sheet, axes)
+        columns.require_true_columns(sheet, axes)
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")
@@ -225,7 +221,7 @@ def _estimator(
     if r.relative is not None and not r.motions:
         cross = columns.cross_covariances(sheet)
     if r.truth_covariance is not None:
-        of_truth = columns.stated_covariance(truth, axes)
+        of_truth = columns.stated_covariance(truth, axes, covariance_columns(list(truth.data), axes))
     estimate = sheet.matrix(axes)
     estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
     nis, dof = columns.nis_columns(sheet)
@@ -275,14 +271,16 @@ def _position(axes: Sequence[str]) -> int:
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:
     """Covariances (N, n, n), which of them are stated, and a note on them."""
-    if convention != ADDITIVE and axes == POSE and columns.has_own(sheet):
-        note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
-        return columns.stated_covariance(sheet, axes, own=True), WHOLE, note
-    deviations = columns.stated_deviations(sheet, axes)
-    if deviations is None:
-        return columns.stated_covariance(sheet, axes), WHOLE, ""
+    if convention != ADDITIVE and axes == POSE:
+        own = columns.own_covariance(sheet)
+        if own is not None:
+            note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
+            return own, WHOLE, note
+    entries = covariance_columns(list(sheet.data), axes)
+    if not entries.without_cross_terms(len(axes)):
+        return columns.stated_covariance(sheet, axes, entries), WHOLE, ""
     note = f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
-    return diagonal(deviations), ALONE, note
+    return diagonal(columns.stated_deviations(sheet, entries)), ALONE, note
 
 
 def _absent(name: str, truth: TableRows, runs: Array, true_runs: Array) -> list[str]:

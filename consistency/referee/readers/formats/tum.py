@@ -13,7 +13,6 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.formats import pose_covariances as stated_as
-from consistency.referee.readers.formats.column_renaming import Columns
 from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
@@ -38,6 +37,7 @@ from consistency.referee.readers.formats.position_truth import (
     require_positions,
 )
 from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.spellings import Columns
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import Places, one_of_each_kind, refuse

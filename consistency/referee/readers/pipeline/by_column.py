@@ -198,8 +198,8 @@ def _sheet(r: Reading) -> TableRows:
     InputError
         It lacks one of them.
     """
-    from consistency.referee.readers.formats.other_names import with_clock
     from consistency.referee.readers.formats.sheet import read_sheet
+    from consistency.referee.readers.formats.table_columns import with_clock
 
     assert r.by is not None
     assert r.by_file is not None

@@ -25,9 +25,8 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.kept_numbers import NUMBERS, keep_numbers, kept_numbers
 from consistency.referee.readers.pipeline.records import records_of
-from consistency.referee.readers.pipeline.run_folders import merged
+from consistency.referee.readers.pipeline.run_folders import NUMBERS, keep_numbers, kept_numbers, merged
 from consistency.referee.readers.places import CutNote, listed
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.system.folders import read_manifest

@@ -368,32 +368,25 @@ def _innovations(e: Estimator) -> Record:
 
 def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions, relative_recording
+    from consistency.referee.readers.pipeline.relative_motions import causes_of_motions, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
-    runs, pairs, stretches = [], [], []
+    runs = []
     for p in e.runs:
         if relative.motions:
             bare = np.append(False, ~p.stated[1:])
             refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
         elif p.cross is not None and not p.stated.all():
             p = p.of_rows(np.flatnonzero(p.stated))
-        known = p.known(r.shift)
-        if not len(known.rows):
-            raise _nothing_known(e, p, r.shift)
+        p = p.later(r.shift)
+        if not len(p.known().rows):
+            raise _nothing_known(e, p, 0.0)
         runs.append(p)
-        pairs.append(p.matched(r.shift))
-        stretches.append(
-            Stretch(
-                p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross, known.rows,
-                known.truth, p.convention, p.by,
-            )
-        )  # fmt: skip
     axes = AXES
-    if stretches[0].d == 2:  # archives do not name them
+    if runs[0].d == 2:  # archives do not name them
         axes = ("x", "y", "heading")
-    record = relative_recording(e.name, str(e.covariances or e.path), stretches, axes, judged, relative)
-    causes = causes_of_motions(e.said, stretches, axes, judged, relative)
-    notes = (*e.notes, *_left_out(e, runs, pairs), *record.notes, *causes)
-    return replace(record, notes=notes, causes=tuple(causes))
+    record = relative_recording(e.name, str(e.covariances or e.path), runs, axes, judged, relative)
+    causes = causes_of_motions(e.said, runs, axes, judged, relative)
+    left_out = _left_out(e, runs, [p.matched() for p in runs])
+    return replace(record, notes=(*e.notes, *left_out, *record.notes, *causes), causes=tuple(causes))

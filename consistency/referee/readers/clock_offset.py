@@ -94,7 +94,8 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9 or not size(0.0) > 0.0:
         return None  # nothing moves, or no error is there to explain
     best = int(np.nanargmin(sizes))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    low = grid[max(best - 1, 0)]
+    high = grid[min(best + 1, len(grid) - 1)]
     found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})
     value = float(grid[best])
     if found.fun < sizes[best]:

@@ -102,7 +102,8 @@ def _matrix(option: str, letters: str, directions: Mapping[str, Array]) -> Array
 def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
     """A run with its truth in other axes, and the covariance of that truth."""
     A, C = change
-    truth, P = p.truth.copy(), p.true_covariance
+    truth = p.truth.copy()
+    P = p.true_covariance
     if not in_space:
         truth[:, :2] = truth[:, :2] @ A[:2, :2].T
         start = A @ C.T

@@ -29,7 +29,8 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
     if not runs or runs[0].manifold != "planar":
         return
     for side, name in (("truth", "truth"), ("estimates", "estimate")):
-        poses, beyond = [], False
+        poses = []
+        beyond = False
         for p in runs:
             values = getattr(p, name)
             poses.append(values[np.isfinite(values).all(axis=1)])
@@ -48,7 +49,8 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
 
 def jumps(headings: Sequence[Array]) -> bool:
     """Whether headings (N,) within one turn of 360 jump by it: where all else is smooth, or often."""
-    found, least = 0, 1
+    found = 0
+    least = 1
     for heading in headings:
         if len(heading) and np.ptp(heading) > 360.0:
             return False
@@ -61,7 +63,9 @@ def jumps(headings: Sequence[Array]) -> bool:
 
 def turn_in_degrees(poses: Sequence[Array]) -> bool:
     """Whether headings of poses (N, 3), read as degrees, explain how the direction of the path turns."""
-    turning, unexplained, steps = 0.0, 0.0, 0
+    turning = 0.0
+    unexplained = 0.0
+    steps = 0
     for each in poses:
         if len(each) < 2:
             continue
@@ -80,12 +84,14 @@ def turn_in_degrees(poses: Sequence[Array]) -> bool:
 
 def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     """Whether errors of headings, read as degrees, are of the size of variances, most of them beyond pi^2."""
-    gaps, variances = [], []
+    gaps = []
+    variances = []
     for p in runs:
         known = p.known()
         gaps.append(known.truth[:, 2] - p.estimate[known.rows, 2])
         variances.append(p.covariance[known.rows, 2, 2])
-    gap, variance = np.concatenate(gaps), np.concatenate(variances)
+    gap = np.concatenate(gaps)
+    variance = np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)
     ratio = np.square(gap[some] - 360.0 * np.round(gap[some] / 360.0)) / variance[some]
     return 2 * len(ratio) > len(gap) and bool(FITTING[0] < np.median(ratio) < FITTING[1])

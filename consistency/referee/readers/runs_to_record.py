@@ -83,7 +83,10 @@ def assemble(
     """
     tracks = sorted(tracks, key=lambda track: track.run)
     _require_different(file, tracks)
-    failures, parts, short, skipped = [], [], [], 0
+    failures = []
+    parts = []
+    short = []
+    skipped = 0
     longest = longest_start(tracks)
     for track in tracks:
         start, end, reason = judged_rows(track, longest)
@@ -106,9 +109,16 @@ def assemble(
         )
     dof = len(axes) if arrays["error"] is not None else 0
     return Record(
-        name, runs=np.array([track.run for track in tracks], dtype=np.int64), t=t, dof=dof, axes=axes,
-        failures=tuple(failures), convention=convention, notes=tuple(notes), **arrays,
-    )  # fmt: skip
+        name,
+        runs=np.array([track.run for track in tracks], dtype=np.int64),
+        t=t,
+        dof=dof,
+        axes=axes,
+        failures=tuple(failures),
+        convention=convention,
+        notes=tuple(notes),
+        **arrays,
+    )
 
 
 def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
@@ -213,7 +223,8 @@ def _first(full: Array) -> int:
 def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
     """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
-    error_ok, kind = np.ones(rows, bool), np.zeros(rows, int)
+    error_ok = np.ones(rows, bool)
+    kind = np.zeros(rows, int)
     if track.error is not None:
         error_ok = np.asarray(np.isfinite(track.error).all(axis=1))
     if track.covariance is not None:
@@ -238,7 +249,8 @@ def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
     arrays: dict[str, Any] = {key: at(getattr(track, key), slice(end)) for key in ("column", "t", *ARRAYS)}
     track = replace(track, place=track.place.at(slice(end)), **arrays)
-    error, P = track.error, track.covariance
+    error = track.error
+    P = track.covariance
     if error is None or P is None:
         return track
     values = np.full(end, np.nan)
@@ -278,7 +290,8 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if not none.any():
         return f"{singular}; write only the states that the filter estimates by themselves"
     singular += f" (variance zero: {', '.join(names[none])})"
-    missing, idle = none & ~still, ~none & still
+    missing = none & ~still
+    idle = ~none & still
     if missing.any() and idle.any():
         return (
             f"{singular}; {', '.join(names[missing])} has errors without a variance, and {', '.join(names[idle])} a "

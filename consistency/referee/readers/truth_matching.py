@@ -96,8 +96,11 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
     apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
     rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
-    before, after, gap = before[rows], after[rows], gap[rows]
-    inside, apart = inside[rows], apart[rows]
+    before = before[rows]
+    after = after[rows]
+    gap = gap[rows]
+    inside = inside[rows]
+    apart = apart[rows]
     share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
     later = ~inside & (np.abs(times[rows] - reference[after]) < np.abs(times[rows] - reference[before]))
     truth = _between(values[np.where(later, after, before)], values[after], share, manifold)

@@ -86,7 +86,8 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     known = [p.known() for p in runs]
 
     def at(frame: WorldTransform) -> tuple[float, list[tuple[Poses, Sound]]]:
-        found, nees = [], 0.0
+        found = []
+        nees = 0.0
         for p, k in zip(runs, known, strict=True):
             there = moved(p, frame)
             sound = sound_of(there, judged, k)
@@ -102,7 +103,8 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
         step, size = _step(found, free, judged)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
-            step, size = 0.5 * step, 0.5 * size
+            step = 0.5 * step
+            size = 0.5 * size
             further = _small(step @ free).after(frame)
         frame = further
         if size <= DONE:
@@ -130,7 +132,8 @@ def orthonormal(tangents: Sequence[Array]) -> list[Array]:
     A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
     U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
     U = U[:, s > RANK * s[0]]
-    bases, start = [], 0
+    bases = []
+    start = 0
     for each in tangents:
         end = start + each.shape[0] * each.shape[1]
         bases.append(U[start:end].reshape(*each.shape[:2], -1))

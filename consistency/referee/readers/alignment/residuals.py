@@ -94,7 +94,8 @@ def clocks_and_frames(
     if isinstance(time_offset, float):
         shift = time_offset
     for _ in range(ROUNDS):
-        before, later = shift, [p.later(shift) for p in runs]
+        before = shift
+        later = [p.later(shift) for p in runs]
         frames = frames_of(name, later, align, judged)
         shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
         if abs(shift - before) <= SETTLED:
@@ -145,7 +146,9 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     """Covariances of the residuals of a fit; unchanged where these are not known."""
     for_all = mode.endswith("-all")
     free = _directions(mode, runs)
-    residuals, tangents, some = [], [], []
+    residuals = []
+    tangents = []
+    some = []
     for i, p in enumerate(runs):
         sound = sound_of(p, judged)
         if len(sound.rows):
@@ -154,7 +157,8 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
             tangents.append(tangent(p, sound, free, judged))
     of = "each run"
     if for_all:
-        bases, of = orthonormal(tangents), "all runs"
+        bases = orthonormal(tangents)
+        of = "all runs"
     else:
         bases = [orthonormal([A])[0] for A in tangents]
     dof = max(Q.shape[-1] for Q in bases)
@@ -169,7 +173,8 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         note = f"the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
         caption = f"{of_runs.caption}, and {OSCILLATING} ({most})"
         return replace(of_runs, notes=(f"{name}: {note}",), caption=caption, unseen=left.unseen)
-    kept, largest = np.empty(len(some)), 0.0
+    kept = np.empty(len(some))
+    largest = 0.0
     for k, M in enumerate(left.covariances):
         kept[k] = max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST)
         largest = max(largest, float(np.linalg.eigvalsh(M)[:, -1].max()))
@@ -189,12 +194,14 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    out, factors = [], []
+    out = []
+    factors = []
     for p in runs:
         first, larger_by = from_first_pose(name, p, judged)
         out.append(first)
         factors.append(larger_by)
-    every, larger = np.concatenate(factors), 1.0
+    every = np.concatenate(factors)
+    larger = 1.0
     if len(every):
         larger = float(np.median(every))
     if larger < 1.0 + SLIGHT:
@@ -235,7 +242,8 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
         No estimate is finite and has a truth and a covariance.
     """
     row, truth = _first(name, p)
-    own, true = p.estimate[[row]], truth[None]
+    own = p.estimate[[row]]
+    true = truth[None]
     turn = (rotations(true, p.manifold) * rotations(own, p.manifold).inv())[0]
     return WorldTransform(turn, (positions(true, p.manifold) - turn.apply(positions(own, p.manifold)))[0])
 
@@ -271,7 +279,8 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
     bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
-    P, index = p.covariance.copy(), np.array(judged)
+    P = p.covariance.copy()
+    index = np.array(judged)
     P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
     P[row] = 0.0
     return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])

@@ -89,7 +89,8 @@ def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
     own, true = _positions(runs)
     if len(own) < 3:
         return None
-    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
+    a = own - own.mean(axis=0)
+    b = true - true.mean(axis=0)
     angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
     turn = Rotation.from_euler("z", angle)
     return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
@@ -119,7 +120,8 @@ def spread(runs: Sequence[Poses]) -> float:
 
 def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
-    own, true = [np.empty((0, 3))], [np.empty((0, 3))]
+    own = [np.empty((0, 3))]
+    true = [np.empty((0, 3))]
     for p in runs:
         estimate, truth = matched(p)
         own.append(positions(estimate, p.manifold))
@@ -148,7 +150,8 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
 
     The turn is the mean of R_estimate' R_truth, the arm the mean of R_estimate' (p_truth - p_estimate).
     """
-    turns, arms = [], []
+    turns = []
+    arms = []
     for p in runs:
         own, true = matched(p)
         if len(own):
@@ -163,7 +166,8 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
 def on_body(p: Poses, body: BodyTransform) -> Poses:
     """The estimates as poses of the other body, with their covariance to first order."""
     finite = np.isfinite(p.estimate).all(axis=1)
-    estimate, covariance = p.estimate.copy(), p.covariance.copy()
+    estimate = p.estimate.copy()
+    covariance = p.covariance.copy()
     if not finite.any():
         return p
     own = p.estimate[finite]
@@ -187,7 +191,8 @@ def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
     derivatives of p + R l at 0.
     """
     J = np.broadcast_to(np.eye(6), (len(R), 6, 6)).copy()
-    back, arm = body.turn.inv().as_matrix(), np.broadcast_to(body.arm, (len(R), 3))
+    back = body.turn.inv().as_matrix()
+    arm = np.broadcast_to(body.arm, (len(R), 3))
     if convention == "left":
         J[:, :3, :3] = back
         J[:, :3, 3:] = -back @ skew(arm)

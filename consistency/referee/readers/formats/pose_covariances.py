@@ -43,7 +43,8 @@ def covariances_in(lines: Lines, order: str) -> Array | None:
     if lines.values.shape[1] != SPLIT:
         return _matrices(numbers, order)
     out = np.zeros((len(numbers), 6, 6))  # two triangles: rotation, then position
-    out[:, 3:, 3:], out[:, :3, :3] = _from_triangle(numbers[:, :6], 3), _from_triangle(numbers[:, 6:], 3)
+    out[:, 3:, 3:] = _from_triangle(numbers[:, :6], 3)
+    out[:, :3, :3] = _from_triangle(numbers[:, 6:], 3)
     return out
 
 

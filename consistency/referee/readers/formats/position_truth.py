@@ -15,7 +15,6 @@ from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import AXES, Poses
 from consistency.referee.types import Array
@@ -81,10 +80,17 @@ def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Pose
     of_truth = poses.true_covariance
     if of_truth is not None:
         of_truth = of_truth[:, :3, :3]
+    J = _jacobian(poses.convention, R, arm, point)
     return replace(
-        poses, estimate=point, covariance=propagated(_jacobian(poses.convention, R, arm, point), poses.covariance),
-        truth=poses.truth[:, :3], manifold="vector", convention="vector", cross=None, true_covariance=of_truth,
-    )  # fmt: skip
+        poses,
+        estimate=point,
+        covariance=propagated(J, poses.covariance),
+        truth=poses.truth[:, :3],
+        manifold="vector",
+        convention="vector",
+        cross=None,
+        true_covariance=of_truth,
+    )
 
 
 def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
@@ -156,9 +162,18 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
         of_truth = of_truth[:, :3, :3]
     P = symmetric(own.covariances, own.place)
     return Poses(
-        Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
-        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance, true_covariance=of_truth,
-    )  # fmt: skip
+        place=own.places,
+        t=own.t,
+        estimate=own.values[:, 1:4],
+        covariance=P,
+        stated=np.ones(len(P), bool),
+        true_t=true.t,
+        truth=true.values[:, 1:4],
+        manifold="vector",
+        convention="vector",
+        max_dt=r.tolerance,
+        true_covariance=of_truth,
+    )
 
 
 def _jacobian(convention: str, R: Array, arm: Array, point: Array) -> Array:

@@ -20,7 +20,7 @@ from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, i
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
-from consistency.referee.readers.places import Places, listed
+from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
 from consistency.referee.types import Array
 
@@ -188,10 +188,23 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
     t = sheet.numbers(key, finite=True)
     state = np.column_stack([nothing, *map(sheet.numbers, sheet.among(axes))])
     nis, dof = columns.nis_columns(sheet)
+    covariance, stated = unstated(len(sheet), 1)
     poses = Poses(
-        Places(sheet.place, np.arange(len(sheet))), t, state, *unstated(len(sheet), 1), t, nothing, "vector", "vector",
-        0.0, numbered=key == "step", clock=_clock(sheet), nis=nis, nis_dof=dof,
-    )  # fmt: skip
+        place=sheet.places,
+        t=t,
+        estimate=state,
+        covariance=covariance,
+        stated=stated,
+        true_t=t,
+        truth=nothing,
+        manifold="vector",
+        convention="vector",
+        max_dt=0.0,
+        numbered=key == "step",
+        clock=_clock(sheet),
+        nis=nis,
+        nis_dof=dof,
+    )
     return Estimator(name, sheet.path, _by_run(sheet, runs, poses), axes, innovations_alone=True)
 
 
@@ -227,11 +240,26 @@ def _estimator(
     nis, dof = columns.nis_columns(sheet)
     by_step = key == "step"
     poses = Poses(
-        Places(sheet.place, np.arange(len(sheet))), sheet.numbers(key, finite=True), estimate, covariance, known,
-        truth.numbers(key), truth.matrix(axes, finite=True), manifold_of(convention), convention,
-        0.0 if by_step else r.tolerance, cross, of_truth, files=(sheet.path, truth.path), numbered=by_step,
-        clock=_clock(sheet), true_clock=_clock(truth), nis=nis, nis_dof=dof, by=columns.own_column(sheet, r),
-    )  # fmt: skip
+        place=sheet.places,
+        t=sheet.numbers(key, finite=True),
+        estimate=estimate,
+        covariance=covariance,
+        stated=known,
+        true_t=truth.numbers(key),
+        truth=truth.matrix(axes, finite=True),
+        manifold=manifold_of(convention),
+        convention=convention,
+        max_dt=0.0 if by_step else r.tolerance,
+        cross=cross,
+        true_covariance=of_truth,
+        files=(sheet.path, truth.path),
+        numbered=by_step,
+        clock=_clock(sheet),
+        true_clock=_clock(truth),
+        nis=nis,
+        nis_dof=dof,
+        by=columns.own_column(sheet, r),
+    )
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
         of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]

@@ -156,7 +156,8 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     if not len(stuck):
         return order
     before, row = order[stuck[0] : stuck[0] + 2]
-    of, hint = "", "; several runs need a column 'run'"
+    of = ""
+    hint = "; several runs need a column 'run'"
     if "run" in sheet:
         of = f" of run {runs[row]}"
         hint = ""

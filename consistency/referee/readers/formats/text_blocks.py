@@ -14,7 +14,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, reading, require_room
-from consistency.referee.readers.places import cut_note, exact, refuse
+from consistency.referee.readers.places import Places, cut_note, exact, refuse
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
@@ -155,6 +155,11 @@ class FileRows:
 
     def place(self, row: int) -> str:
         return f"{self.path}, {self.unit} {self.line[row]}"
+
+    @property
+    def places(self) -> Places:
+        """Places of all rows."""
+        return Places(self.place, np.arange(len(self.line)))
 
     def open_end(self, row: int = -1) -> str:
         """What to note of a row if it is cut short; "" where its line has an end."""

@@ -40,7 +40,7 @@ from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.spellings import Columns
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
-from consistency.referee.readers.places import Places, one_of_each_kind, refuse
+from consistency.referee.readers.places import one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
     ALONE,
@@ -143,9 +143,19 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
     axes = STATE[: poses[0].covariance.shape[-1]]
     return Estimator(
-        path.stem, path, poses, axes, kind, definition, layout.stated, path.name, r.covariance,
-        one_of_each_kind(notes), in_space=True, position=3,
-    )  # fmt: skip
+        path.stem,
+        path,
+        poses,
+        axes,
+        kind,
+        definition,
+        layout.stated,
+        label=path.name,
+        covariances=r.covariance,
+        notes=one_of_each_kind(notes),
+        in_space=True,
+        position=3,
+    )
 
 
 def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
@@ -205,13 +215,23 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
         for lines, name in zip((own, true), run.files, strict=True):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        place = Places(own.place, np.arange(len(own.t)))
+        covariance, stated = unstated(len(own.t), 6)
         poses.append(
             Poses(
-                place, own.t, own.values[:, pose], *unstated(len(own.t), 6), true.t, true.values[:, pose], "spatial",
-                "left", r.tolerance, name=own.path.stem, files=run.files,
+                place=own.places,
+                t=own.t,
+                estimate=own.values[:, pose],
+                covariance=covariance,
+                stated=stated,
+                true_t=true.t,
+                truth=true.values[:, pose],
+                manifold="spatial",
+                convention="left",
+                max_dt=r.tolerance,
+                name=own.path.stem,
+                files=run.files,
             )
-        )  # fmt: skip
+        )
     return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
 
 
@@ -230,9 +250,19 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     of_truth = _of_truth(true, own, order, r)
     own = own.of(slice(0, POSE))
     poses = Poses(
-        Places(own.place, np.arange(len(own.t))), own.t, _states(own, k), P, known, true.t, _states(true, k), "spatial",
-        layout.convention, r.tolerance, cross, of_truth,
-    )  # fmt: skip
+        place=own.places,
+        t=own.t,
+        estimate=_states(own, k),
+        covariance=P,
+        stated=known,
+        true_t=true.t,
+        truth=_states(true, k),
+        manifold="spatial",
+        convention=layout.convention,
+        max_dt=r.tolerance,
+        cross=cross,
+        true_covariance=of_truth,
+    )
     if _is_point(true):
         poses = positions(poses, r.lever_arm, layout.stated != WHOLE)
     return poses, note

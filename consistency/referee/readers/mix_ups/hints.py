@@ -63,7 +63,8 @@ def hints(
     if not runs:
         return []
     part = list(range(len(axes)) if judged is None else judged)
-    some, worlds = runs, errors_without is None
+    some = runs
+    worlds = errors_without is None
     if errors_without is None:
         some = thinned(runs, shift)
         errors_without = partial(_errors_without, some)
@@ -142,7 +143,8 @@ def _candidates(
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
     """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
-    right, at_need = [], []
+    right = []
+    at_need = []
     for one in candidates:
         if one.size * one.gain < bar or not one.fit.right(gross) or _status(one.fit) > _status(declared):
             continue

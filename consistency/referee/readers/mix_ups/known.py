@@ -40,7 +40,8 @@ class Guess:
 
 def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
     """Possible mix-ups of covariances, units and orders, the likelier first; ``part`` is judged."""
-    kind, convention = runs[0].manifold, runs[0].convention
+    kind = runs[0].manifold
+    convention = runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
         return list(_blocks(n))
@@ -303,7 +304,8 @@ def _of_root(P: Array) -> Array:
 
 def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out, block = np.full_like(P, np.nan), submatrices(P, part)
+    out = np.full_like(P, np.nan)
+    block = submatrices(P, part)
     finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
     regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
     out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])

@@ -27,7 +27,8 @@ TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that dif
 
 def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
     """Possible mix-ups of the worlds and bodies of poses, the likelier first; none of other states."""
-    kind, convention = runs[0].manifold, runs[0].convention
+    kind = runs[0].manifold
+    convention = runs[0].convention
     if kind == "vector" or runs[0].covariance.shape[-1] > 6:
         return []
     axes = _ned(convention) if kind == "spatial" else [_mirrored(convention)]
@@ -80,7 +81,8 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
     angle = np.rad2deg(frame.heading)
     several = len(runs) > 1
     if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn, mode = "", "posyaw"
+        turn = ""
+        mode = "posyaw"
         if abs(angle) > TURN:
             turn = f"turned by {angle:.1f} degrees about z and "
         if several:
@@ -100,7 +102,8 @@ def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
     body = fitted_body(runs)
     if body is None:
         return
-    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
+    angle = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0
+    size = spread(runs)
     parts = []
     if np.linalg.norm(angle) >= TURN:
         turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"

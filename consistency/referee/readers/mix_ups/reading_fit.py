@@ -148,7 +148,8 @@ class ReadingFit:
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
-        constant, growing = self.error.mean(axis=0) / self.sigma, np.tile(self.own.mean(axis=0), (len(self.own), 1))
+        constant = self.error.mean(axis=0) / self.sigma
+        growing = np.tile(self.own.mean(axis=0), (len(self.own), 1))
         gains = [self._with_bias(constant), self._with_bias(growing), *map(self._with_factor, groups)]
         return self.likelihood + max(gains)
 
@@ -194,11 +195,13 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     if not good.any():
         return None
     if not definite.all():
-        L, sigma = L[definite], sigma[definite]
+        L = L[definite]
+        sigma = sigma[definite]
     error = errors[good]
     w = np.full(errors.shape, np.nan)
     w[good] = _solved(L, error / sigma)
-    whitened, start = [], 0
+    whitened = []
+    start = 0
     for own, _ in runs:
         part = w[start : start + len(own)]
         part = part[np.isfinite(part).all(axis=1)]
@@ -241,8 +244,10 @@ def _solved(L: Array, x: Array) -> Array:
 
 def _memory(runs: Sequence[Array]) -> float:
     """1 + 2 sum over lags l of (1 - l / k) rho_l^2 of a component, over all runs, the largest; k is the longest run."""
-    k, n = max(map(len, runs)), runs[0].shape[1]
-    total, pairs = np.zeros((k, n)), np.zeros((k, 1))
+    k = max(map(len, runs))
+    n = runs[0].shape[1]
+    total = np.zeros((k, n))
+    pairs = np.zeros((k, 1))
     for run in runs:
         own = len(run)
         transform = np.fft.rfft(run, 2 * own, axis=0)

@@ -45,7 +45,8 @@ def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estima
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
     column = column_of(r.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
-    runs, start = [], 0
+    runs = []
+    start = 0
     for p in e.runs:
         end = start + len(p.t)
         runs.append(replace(p, by=column.values[start:end]))
@@ -76,7 +77,10 @@ def in_groups(
 def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
     """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
     columns = _columns_of(e, judged)
-    values, truth, estimate, P = [], [], [], []
+    values = []
+    truth = []
+    estimate = []
+    P = []
     for p in pairs:
         some = p.pairs(_some(len(p.t), len(pairs)))
         assert some.by is not None

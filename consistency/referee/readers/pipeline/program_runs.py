@@ -157,7 +157,8 @@ class ProgramStudy:
         """
         own: dict[str, Any] = {}
         for name in r.given(PATHS):
-            path, base = str(getattr(r, name)), run.folder
+            path = str(getattr(r, name))
+            base = run.folder
             if "input" in run.values and is_recorded(path):
                 base = Path(run.values["here"])
             own[name] = base / filled(path, run.known)
@@ -218,7 +219,9 @@ class Runs:
     """
 
     def __init__(self, study: ProgramStudy, r: Reading, found_in: Reader) -> None:
-        self.study, self.options, self._found_in = study, r, found_in
+        self.study = study
+        self.options = r
+        self._found_in = found_in
         self.found: dict[int, Sequence[Estimator]] = {}
         self.failed: dict[int, str] = {}
         self.trials: dict[int, str] = {}
@@ -264,7 +267,8 @@ class Runs:
         """
         if self.study.manifest.get("inputs"):
             return {}
-        early, ends = {}, {}
+        early = {}
+        ends = {}
         for run in runs:
             ends[run], late = self._ends[run]
             if late:
@@ -331,7 +335,8 @@ def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
             kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
     if not kinds:
         return []
-    runs, sentences = runs_in(folder), []
+    runs = runs_in(folder)
+    sentences = []
     for of_runs in kinds.values():
         first, why = min(of_runs.items())
         which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
@@ -392,7 +397,8 @@ def _end_of(p: Poses) -> tuple[float, str]:
 
 def _digest(found: Sequence[Estimator]) -> str:
     """Digest of the truth of a run."""
-    p, digest = found[0].runs[0], hashlib.sha256()
+    p = found[0].runs[0]
+    digest = hashlib.sha256()
     for array in (p.true_t, p.truth):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]

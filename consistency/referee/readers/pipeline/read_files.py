@@ -218,7 +218,8 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
             return frame_rows(table, name)
         return None if table is None else Path(table)
 
-    sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
+    sheet = rows(estimates, "estimates")
+    true = rows(truth, "truth")
     r = checked_options(replace(reading, truth=cast(Any, true)))
     refuse_options(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))

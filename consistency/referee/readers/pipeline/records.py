@@ -56,12 +56,14 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     if e.innovations_alone and r.by is None:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
-    judged, column = _judged(e, r), None
+    judged = _judged(e, r)
+    column = None
     if r.by is not None:
         from consistency.referee.readers.pipeline.by_column import with_values
 
         e, column = with_values(e, r, judged)
-    relative, pairs = windows_asked(r), list[Poses]()
+    relative = windows_asked(r)
+    pairs = list[Poses]()
     if relative is not None:
         records = [_record_of_windows(e, judged, r, relative)]
     else:
@@ -100,14 +102,16 @@ def _judged(e: Estimator, r: Reading) -> list[int]:
 
 def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
     """Records of the poses of an estimator, and the estimates of each run that they judge, beside their truth."""
-    runs, shift = e.runs, 0.0
+    runs = e.runs
+    shift = 0.0
     of_clocks: list[str] = []
     of_alignment: dict[str, Any] = {}
     if r.align is not None:
         from consistency.referee.readers.alignment.residuals import clocks_and_frames
 
         shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
-        runs, of_alignment = moved.runs, moved.of_record
+        runs = moved.runs
+        of_alignment = moved.of_record
         of_clocks += moved.notes
     elif not runs[0].numbered:
         from consistency.referee.readers.clock_offset import clock_shift
@@ -140,13 +144,15 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         part = [i for i in range(len(e.axes))[group] if i in judged]
         if not part:
             continue
-        some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
+        some = [track.part(part) for track in tracks]
+        axes = tuple(e.axes[i] for i in part)
         record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
         record = replace(record, causes=tuple(causes), **of_alignment)
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
-        notes, causes = [], []
+        notes = []
+        causes = []
     return records, pairs
 
 
@@ -168,7 +174,8 @@ def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
         raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
     found = found.pairs(found.stated)
     if found.numbered and found.clock is not None and found.true_clock is not None:
-        t, true_t = found.clock, found.true_clock
+        t = found.clock
+        true_t = found.true_clock
         where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
         refuse(
             np.abs(t - true_t) > r.tolerance + ROUNDING,
@@ -213,8 +220,11 @@ def _is_cut(p: Poses, whole: Poses) -> bool:
 
 def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> list[str]:
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
-    notes, what = [], "no truth"
-    total, left_out, furthest = 0, 0, 0.0
+    notes = []
+    what = "no truth"
+    total = 0
+    left_out = 0
+    furthest = 0.0
     for p, found in zip(runs, pairs, strict=True):
         total += len(p.t)
         left_out += len(p.t) - len(found.t)
@@ -274,7 +284,8 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
 def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
     """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
     part = np.array(judged)
-    variances, of_part = [], []
+    variances = []
+    of_part = []
     for p, error in zip(e.runs, errors, strict=True):
         variances.append(_variances(p)[p.stated][:, part])
         of_part.append(error[:, part])
@@ -314,15 +325,25 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
-    path, t, width = None, None, e.position
+    path = t = None
+    width = e.position
     if width:
         path = np.stack([p.truth[:, :width], p.estimate[:, :width]], axis=1)
     if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
         t = p.seconds
     return Track(
-        p.run, np.arange(len(p.t)), p.place, error, p.covariance, p.nis, p.nis_dof, by=p.by, t=t,
-        truth_covariance=p.true_covariance, path=path,
-    )  # fmt: skip
+        p.run,
+        np.arange(len(p.t)),
+        p.place,
+        error,
+        p.covariance,
+        p.nis,
+        p.nis_dof,
+        by=p.by,
+        t=t,
+        truth_covariance=p.true_covariance,
+        path=path,
+    )
 
 
 def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -> tuple[list[Track], Array, list[str]]:
@@ -333,7 +354,9 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     if e.t is not None:
         columns = [p.t.astype(np.int64) for p in pairs]
         return in_columns(tracks, columns), e.t, []
-    keys, seconds, some = [], [], []
+    keys = []
+    seconds = []
+    some = []
     for p, track in zip(pairs, tracks, strict=True):
         if len(p.t):
             keys.append(p.t)

@@ -92,9 +92,15 @@ def _one_estimator(
         notes |= {_without_paths(note, one): note for note in one.notes}
         causes |= {_without_paths(cause, one): cause for cause in one.causes}
     return replace(
-        first, name=name, label=name, runs=poses, t=t, failed={**without, **failed},
-        notes=list(reversed(notes.values())), causes=list(reversed(causes.values())),
-    )  # fmt: skip
+        first,
+        name=name,
+        label=name,
+        runs=poses,
+        t=t,
+        failed={**without, **failed},
+        notes=list(reversed(notes.values())),
+        causes=list(reversed(causes.values())),
+    )
 
 
 def _without_paths(note: str, one: Estimator) -> str:

@@ -11,7 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, finite_rows
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for
@@ -165,6 +165,6 @@ def _errors_and_motion(poses: Poses, shift: float) -> tuple[Array, Array]:
 def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
     """Sums of the products of ``along`` with errors ``e`` and with their motion ``v``, each (N, n), (parts, 2)."""
     products = np.column_stack([(along * e).sum(axis=1), (along * v).sum(axis=1)])
-    fine = np.isfinite(products).all(axis=1) & (np.square(e).mean(axis=1) < CAP)
+    fine = finite_rows(products) & (np.square(e).mean(axis=1) < CAP)
     groups = np.array_split(np.flatnonzero(fine), parts)
     return np.array([products[rows].sum(axis=0) for rows in groups])

@@ -8,7 +8,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, finite_rows
 from consistency.referee.types import Array
 
 JUMP, SMOOTH, OFTEN = 180.0, 60.0, 3  # degrees between rows, and what is left less a whole turn; no rad jump as often
@@ -33,7 +33,7 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
         beyond = False
         for p in runs:
             values = getattr(p, name)
-            poses.append(values[np.isfinite(values).all(axis=1)])
+            poses.append(values[finite_rows(values)])
             beyond |= bool((np.abs(poses[-1][:, 2]) > 2.0 * np.pi + 0.1).any())
         if beyond and jumps([each[:, 2] for each in poses]):
             why = "jump by a whole turn of 360"

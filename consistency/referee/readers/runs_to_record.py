@@ -16,7 +16,7 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
-from consistency.referee.readers.truth_matching import at, submatrices
+from consistency.referee.readers.truth_matching import at, finite_rows, submatrices
 from consistency.referee.types import Array, Failure, Indices
 
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
@@ -226,7 +226,7 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
     error_ok = np.ones(rows, bool)
     kind = np.zeros(rows, int)
     if track.error is not None:
-        error_ok = np.asarray(np.isfinite(track.error).all(axis=1))
+        error_ok = finite_rows(track.error)
     if track.covariance is not None:
         kind = classify(track.covariance, ROUNDED)
     full: Array = np.asarray(kind == Validity.VALID)

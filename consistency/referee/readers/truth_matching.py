@@ -223,7 +223,7 @@ class Poses:
     def error_of(self, rows: Indices, truth: Array) -> Array:
         """Error (k, n) of some rows; NaN where the estimate is not finite."""
         estimate = self.estimate[rows]
-        finite = np.isfinite(estimate).all(axis=1)
+        finite = finite_rows(estimate)
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
         error = planar_error
         if self.manifold == "spatial":
@@ -252,7 +252,7 @@ class Poses:
 
     def sound(self) -> Poses:
         """Estimates that are finite, with a finite covariance."""
-        finite = np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2))
+        finite = finite_rows(self.estimate) & finite_rows(self.covariance)
         return self.of_rows(np.flatnonzero(finite))
 
     def some(self, most: int) -> Poses:
@@ -291,6 +291,11 @@ def at(values: Array | None, rows: Any) -> Array | None:
     if values is None:
         return None
     return np.asarray(values[rows])
+
+
+def finite_rows(values: Array) -> Array:
+    """Which rows of values (N, ...) hold finite numbers alone, (N,) of bool."""
+    return np.asarray(np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
 
 
 def submatrices(P: Array, index: Sequence[int]) -> Array:

@@ -18,7 +18,7 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     turned_frame,
 )
-from consistency.referee.readers.truth_matching import Known, Poses, submatrices
+from consistency.referee.readers.truth_matching import Known, Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken
@@ -40,7 +40,7 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
     if known is None:
         known = p.known()
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
-    fine = np.isfinite(w).all(axis=1) & p.stated[known.rows]
+    fine = finite_rows(w) & p.stated[known.rows]
     return Sound(known.rows[fine], known.truth[fine], w[fine])
 
 

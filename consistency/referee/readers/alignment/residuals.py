@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, positions, rotations
 from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
-from consistency.referee.readers.truth_matching import Poses, submatrices
+from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -251,8 +251,8 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
 def _first(name: str, p: Poses) -> tuple[int, Array]:
     """Row of the first estimate that is finite and has a truth and a covariance, and its truth (m,)."""
     known = p.known()
-    fine = p.stated[known.rows] & np.isfinite(p.estimate[known.rows]).all(axis=1)
-    fine &= np.isfinite(p.covariance[known.rows]).all(axis=(1, 2))
+    fine = p.stated[known.rows] & finite_rows(p.estimate[known.rows])
+    fine &= finite_rows(p.covariance[known.rows])
     if not fine.any():
         raise InputError(f"--align origin: a run of {name} has no estimate with a truth and a covariance to begin at")
     k = int(np.argmax(fine))

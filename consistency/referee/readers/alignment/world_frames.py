@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Manifold, Poses, submatrices
+from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
 
@@ -40,7 +40,7 @@ class WorldTransform:
     def placed(self, values: Array, manifold: Manifold) -> Array:
         """Poses or positions (k, m) of one world in the other; those that are not finite stay."""
         out: Array = values.copy()
-        finite = np.isfinite(values).all(axis=1)
+        finite = finite_rows(values)
         if manifold == "planar":
             out[:, :2] = values[:, :2] @ self.turn.as_matrix()[:2, :2].T + self.shift[:2]
             out[:, 2] = wrap(values[:, 2] + self.heading)
@@ -133,7 +133,7 @@ def matched(p: Poses) -> tuple[Array, Array]:
     """Estimates that are finite and have a truth, and that truth, (k, m) both."""
     known = p.known()
     estimate = p.estimate[known.rows]
-    finite = np.isfinite(estimate).all(axis=1)
+    finite = finite_rows(estimate)
     return estimate[finite], known.truth[finite]
 
 
@@ -165,7 +165,7 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
 
 def on_body(p: Poses, body: BodyTransform) -> Poses:
     """The estimates as poses of the other body, with their covariance to first order."""
-    finite = np.isfinite(p.estimate).all(axis=1)
+    finite = finite_rows(p.estimate)
     estimate = p.estimate.copy()
     covariance = p.covariance.copy()
     if not finite.any():

@@ -25,6 +25,7 @@ from consistency.referee.readers.formats.spellings import Clock, Columns, clock_
 from consistency.referee.readers.formats.table_columns import times_of
 from consistency.referee.readers.formats.text_blocks import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.places import refuse
+from consistency.referee.readers.truth_matching import finite_rows
 from consistency.referee.types import Array, Indices
 
 POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
@@ -71,7 +72,7 @@ def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     if head is None or found is None or not found.quaternion:
         return None
     lines = _named(path, head, found, True, columns)
-    finite = np.asarray(np.isfinite(lines.values).all(axis=1))
+    finite = finite_rows(lines.values)
     return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
 
@@ -195,7 +196,7 @@ def _are_rigid(numbers: Array) -> Indices:
     right = are_rotations(M[:, :3, :3])
     if M.shape[1] == 4:
         right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < TOLERANCE
-    return np.asarray(right | ~np.isfinite(numbers).all(axis=1))
+    return np.asarray(right | ~finite_rows(numbers))
 
 
 def _matrices(lines: Lines) -> Lines:
@@ -206,7 +207,7 @@ def _matrices(lines: Lines) -> Lines:
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)
     quaternion = quaternions(M[:, :3, :3])
-    quaternion[~np.isfinite(numbers).all(axis=1)] = np.nan
+    quaternion[~finite_rows(numbers)] = np.nan
     note = f"{lines.path}: read as matrices of {M.shape[1]} x 4, {lines.values.shape[1]} columns, {clock}"
     return increasing(replace(lines, values=np.column_stack([t, M[:, :3, 3], quaternion, covariance]), note=note))
 

@@ -16,7 +16,7 @@ from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import AXES, Poses
+from consistency.referee.readers.truth_matching import AXES, Poses, finite_rows
 from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
@@ -73,7 +73,7 @@ def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Pose
         what = "moves errors of the rotation into that of the position, whose cross terms are not stated"
         raise InputError(f"{poses.place[0]}: {option} {what}; give covariances of whole poses")
     R = np.full((len(poses.t), 3, 3), np.nan)
-    finite = np.isfinite(poses.estimate).all(axis=1)
+    finite = finite_rows(poses.estimate)
     if finite.any():
         R[finite] = Rotation.from_quat(poses.estimate[finite, 3:]).as_matrix()
     point = poses.estimate[:, :3] + R @ arm
@@ -125,7 +125,7 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
     too few rows have a truth.
     """
     known = one.known()
-    finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
+    finite = finite_rows(one.estimate[known.rows])
     rows = known.rows[finite]
     true = known.truth[finite, :3]
     if len(rows) < FEWEST:

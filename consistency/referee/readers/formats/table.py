@@ -21,7 +21,16 @@ from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import listed
-from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
+from consistency.referee.readers.truth_matching import (
+    ALONE,
+    WHOLE,
+    Estimator,
+    Poses,
+    Stated,
+    finite_rows,
+    manifold_of,
+    unstated,
+)
 from consistency.referee.types import Array
 
 POSE = tuple(POSE_NAMES)
@@ -236,7 +245,7 @@ def _estimator(
     if r.truth_covariance is not None:
         of_truth = columns.stated_covariance(truth, axes, covariance_columns(list(truth.data), axes))
     estimate = sheet.matrix(axes)
-    estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
+    estimate[~finite_rows(estimate)] = np.nan
     nis, dof = columns.nis_columns(sheet)
     by_step = key == "step"
     poses = Poses(

@@ -52,6 +52,7 @@ from consistency.referee.readers.truth_matching import (
     Estimator,
     Poses,
     Stated,
+    finite_rows,
     unstated,
 )
 from consistency.referee.types import Array
@@ -411,7 +412,7 @@ def _checked(lines: Lines, true: bool = True) -> Lines:
     """Poses whose quaternions have unit length, and which are finite if they are a truth."""
     pose = lines.values[:, 1:POSE]
     if true:
-        refuse(~np.isfinite(pose).all(axis=1), lines.place, "the truth is not finite; leave such lines out")
+        refuse(~finite_rows(pose), lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):
         return lines
     bad, length = not_unit(pose)

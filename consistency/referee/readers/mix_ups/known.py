@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.geometry.groups import inverse, matrices, vectors
-from consistency.referee.readers.truth_matching import Change, Poses, submatrices
+from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
 ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
@@ -87,7 +87,7 @@ def _blocks(n: int) -> Iterator[Guess]:
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
     P = submatrices(np.concatenate([p.covariance for p in runs]), part)
-    P = P[np.isfinite(P).all(axis=(1, 2))]
+    P = P[finite_rows(P)]
     if len(part) < 2 or not len(P):
         return
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
@@ -113,7 +113,7 @@ def _diagonal(P: Array) -> Array:
 
 def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
     """The run with a function of those estimates that are finite."""
-    finite = np.isfinite(p.estimate).all(axis=1)
+    finite = finite_rows(p.estimate)
     estimate = p.estimate.copy()
     if finite.any():
         estimate[finite] = function(estimate[finite])
@@ -129,7 +129,7 @@ def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[G
     for first in range(len(axes) - 3):
         four = slice(first, first + 4)
         values = np.concatenate([np.concatenate([p.estimate, p.truth])[:, four] for p in runs])
-        values = values[np.isfinite(values).all(axis=1)]
+        values = values[finite_rows(values)]
         if not len(values) or (np.abs(np.linalg.norm(values, axis=1) - 1.0) > UNIT).any():
             continue
         for w in (3, 0):
@@ -306,7 +306,7 @@ def _inverted(P: Array, part: list[int]) -> Array:
     """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
     out = np.full_like(P, np.nan)
     block = submatrices(P, part)
-    finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
+    finite = np.flatnonzero(finite_rows(block))
     regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
     out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
     return out

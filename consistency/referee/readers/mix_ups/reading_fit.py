@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.readers.truth_matching import Poses, submatrices
+from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 
 MOST = 1000  # estimates that are looked at, of all runs together
@@ -186,7 +186,7 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     P = np.concatenate([covariance for _, covariance in runs])
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
-        good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
+        good = finite_rows(errors) & finite_rows(P) & (variance > 0).all(axis=1)
     sigma = np.sqrt(variance[good])
     R = P[good]
     R /= sigma[:, :, None] * sigma[:, None, :]
@@ -204,7 +204,7 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     start = 0
     for own, _ in runs:
         part = w[start : start + len(own)]
-        part = part[np.isfinite(part).all(axis=1)]
+        part = part[finite_rows(part)]
         if len(part):
             whitened.append(part)
         start += len(own)

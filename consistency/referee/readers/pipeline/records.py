@@ -27,6 +27,7 @@ from consistency.referee.readers.truth_matching import (
     Poses,
     common_steps,
     common_times,
+    finite_rows,
 )
 from consistency.referee.types import Array
 
@@ -382,7 +383,7 @@ def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        error = np.where(np.isfinite(p.estimate).all(axis=1), 0.0, np.nan)[:, None]
+        error = np.where(finite_rows(p.estimate), 0.0, np.nan)[:, None]
         tracks.append(Track(p.run, np.arange(len(p.t)), p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])

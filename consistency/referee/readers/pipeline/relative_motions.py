@@ -20,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.mix_ups.hints import Pairs, hints
 from consistency.referee.readers.runs_to_record import Track, assemble, in_columns
-from consistency.referee.readers.truth_matching import Change, Poses, at, common_times
+from consistency.referee.readers.truth_matching import Change, Poses, at, common_times, finite_rows
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
@@ -92,9 +92,9 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
 
 def _sound(p: Poses, relative: Relative) -> int:
     """The first row that is broken; the first row of motions is only where they start."""
-    ok: Array = np.asarray(np.isfinite(p.estimate).all(axis=1) & np.isfinite(p.covariance).all(axis=(1, 2)))
+    ok: Array = np.asarray(finite_rows(p.estimate) & finite_rows(p.covariance))
     if p.cross is not None:
-        ok[1:] &= np.isfinite(p.cross[1:]).all(axis=(1, 2))
+        ok[1:] &= finite_rows(p.cross[1:])
     if relative.motions:
         ok[0] = True
     return int(np.argmin(np.append(ok, False)))
@@ -215,7 +215,7 @@ def _widest(found: Sequence[Windows]) -> float:
     P = np.concatenate([one.covariance for one in found])
     first = {3: 2, 6: 3}[P.shape[-1]]
     angles = P[:, first:, first:]
-    angles = angles[np.isfinite(angles).all(axis=(1, 2))]
+    angles = angles[finite_rows(angles)]
     if not len(angles):
         return 0.0
     largest = np.linalg.eigvalsh(angles)[:, -1]

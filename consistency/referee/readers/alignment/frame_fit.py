@@ -22,7 +22,8 @@ from consistency.referee.readers.truth_matching import Known, Poses, finite_rows
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken
-ROUNDS, DONE = 20, 1e-3  # steps of a fit at most; the last one, in stated standard deviations: the next is its square
+ROUNDS = 20  # steps of a fit at most
+DONE = 1e-3  # size of the last one, in stated standard deviations: the next is its square
 RANK = 1e-10  # of the largest singular value: directions that no error shows
 
 
@@ -46,7 +47,11 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
     index = list(judged)
-    return by_runs(lambda e, at: whiten(e[:, index], submatrices(p.covariance[at], index)), error, rows)
+
+    def of_block(e: Array, at: Indices) -> Array:
+        return whiten(e[:, index], submatrices(p.covariance[at], index))
+
+    return by_runs(of_block, error, rows)
 
 
 def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
@@ -65,7 +70,8 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
         for k, motion in enumerate(STEP * free):
             after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
             before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
-            out[:, :, k] = _whitened(p, rows, (after - before) / (2.0 * STEP), judged)
+            change = (after - before) / (2.0 * STEP)
+            out[:, :, k] = _whitened(p, rows, change, judged)
         return out
 
     return by_runs(of_block, sound.truth, sound.rows)
@@ -115,8 +121,13 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
 
 def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
     """Gauss-Newton step (d,), and its length in stated standard deviations."""
-    A = np.concatenate([tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in found])
-    w = np.concatenate([sound.whitened.ravel() for _, sound in found])
+    tangents = []
+    whitened = []
+    for p, sound in found:
+        tangents.append(tangent(p, sound, free, judged).reshape(-1, len(free)))
+        whitened.append(sound.whitened.ravel())
+    A = np.concatenate(tangents)
+    w = np.concatenate(whitened)
     scale = _sizes(A)
     step = -np.linalg.lstsq(A / scale, w, rcond=RANK)[0] / scale
     return step, float(np.linalg.norm(A @ step))

@@ -104,8 +104,10 @@ def clocks_and_frames(
         found = aligned(name, later, align, judged, frames)
     else:
         found = aligned(name, [p.later(shift) for p in runs], align, judged)
-    back = zip(found.runs, runs, strict=True)
-    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in back])
+    as_before = []
+    for p, own in zip(found.runs, runs, strict=True):
+        as_before.append(replace(p, t=own.t))
+    return shift, notes, replace(found, runs=as_before)
 
 
 def _moved(runs: Sequence[Poses], frames: Sequence[WorldTransform]) -> list[Poses]:
@@ -136,7 +138,8 @@ def aligned(
         frames = frames_of(name, runs, mode, judged)
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    return replace(found, align=mode, notes=(_sizes(name, mode, frames), *found.notes))
+    sizes = _sizes(name, mode, frames)
+    return replace(found, align=mode, notes=(sizes, *found.notes))
 
 
 # --- residual errors -------------------------------------------------------------------------------------------
@@ -176,8 +179,10 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     kept = np.empty(len(some))
     largest = 0.0
     for k, M in enumerate(left.covariances):
-        kept[k] = max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST)
-        largest = max(largest, float(np.linalg.eigvalsh(M)[:, -1].max()))
+        share = float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged)
+        kept[k] = max(share, LEAST)
+        of_run = float(np.linalg.eigvalsh(M)[:, -1].max())
+        largest = max(largest, of_run)
     out = list(runs)
     for i, share in zip(some, kept, strict=True):
         out[i] = replace(runs[i], covariance=runs[i].covariance * share)
@@ -244,8 +249,10 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
     row, truth = _first(name, p)
     own = p.estimate[[row]]
     true = truth[None]
-    turn = (rotations(true, p.manifold) * rotations(own, p.manifold).inv())[0]
-    return WorldTransform(turn, (positions(true, p.manifold) - turn.apply(positions(own, p.manifold)))[0])
+    turns = rotations(true, p.manifold) * rotations(own, p.manifold).inv()
+    turn = turns[0]
+    shift = positions(true, p.manifold) - turn.apply(positions(own, p.manifold))
+    return WorldTransform(turn, shift[0])
 
 
 def _first(name: str, p: Poses) -> tuple[int, Array]:
@@ -275,13 +282,15 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     sound = sound_of(p, judged)
     seen = submatrices(_seen(name, p, row, sound), judged)
     own = submatrices(p.covariance[sound.rows], judged)
-    size = np.trace(np.linalg.solve(own, seen), axis1=1, axis2=2) / len(judged)
+    ratio = np.linalg.solve(own, seen)
+    size = np.trace(ratio, axis1=1, axis2=2) / len(judged)
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
     bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
     P = p.covariance.copy()
     index = np.array(judged)
-    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
+    mirrored = np.swapaxes(bound, 1, 2)
+    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + mirrored)
     P[row] = 0.0
     return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
 
@@ -292,7 +301,10 @@ def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
     free = np.eye(6)
     if n == 3:
         free = free[[0, 1, 5]]
-    plain = replace(p, covariance=np.tile(np.eye(n), (len(p.t), 1, 1)))
-    first = Sound(np.array([row]), _first(name, p)[1][None], np.zeros((1, n)))
-    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(tangent(plain, first, free, range(n))[0])
+    alike = np.tile(np.eye(n), (len(p.t), 1, 1))
+    plain = replace(p, covariance=alike)
+    _, truth = _first(name, p)
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)))
+    of_first = tangent(plain, first, free, range(n))[0]
+    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(of_first)
     return np.asarray(J @ p.covariance[row] @ np.swapaxes(J, 1, 2))

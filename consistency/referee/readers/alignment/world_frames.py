@@ -26,7 +26,8 @@ class WorldTransform:
     @staticmethod
     def about_z(angle: float, shift: Array) -> WorldTransform:
         """Turn by ``angle``, rad, and shift (2,) or (3,), m."""
-        return WorldTransform(Rotation.from_euler("z", angle), np.append(shift, np.zeros(3 - len(shift))))
+        level = np.zeros(3 - len(shift))
+        return WorldTransform(Rotation.from_euler("z", angle), np.append(shift, level))
 
     @property
     def heading(self) -> float:
@@ -42,12 +43,14 @@ class WorldTransform:
         out: Array = values.copy()
         finite = finite_rows(values)
         if manifold == "planar":
-            out[:, :2] = values[:, :2] @ self.turn.as_matrix()[:2, :2].T + self.shift[:2]
+            R = self.turn.as_matrix()[:2, :2]
+            out[:, :2] = values[:, :2] @ R.T + self.shift[:2]
             out[:, 2] = wrap(values[:, 2] + self.heading)
         elif finite.any():
             out[finite, :3] = self.turn.apply(values[finite, :3]) + self.shift
             if manifold == "spatial":
-                out[finite, 3:] = (self.turn * Rotation.from_quat(values[finite, 3:])).as_quat()
+                turned = self.turn * Rotation.from_quat(values[finite, 3:])
+                out[finite, 3:] = turned.as_quat()
         return out
 
 
@@ -58,7 +61,8 @@ IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 def moved(p: Poses, frame: WorldTransform) -> Poses:
     """The estimates in another world, with their covariance."""
     T = carried(p.convention, frame, p.covariance.shape[-1])
-    return replace(p, estimate=frame.placed(p.estimate, p.manifold), covariance=T @ p.covariance @ T.T)
+    estimate = frame.placed(p.estimate, p.manifold)
+    return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
 
 
 def carried(convention: str, frame: WorldTransform, n: int) -> Array:
@@ -91,7 +95,9 @@ def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
         return None
     a = own - own.mean(axis=0)
     b = true - true.mean(axis=0)
-    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    across = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
+    along = (a[:, :2] * b[:, :2]).sum()
+    angle = float(np.arctan2(across, along))
     turn = Rotation.from_euler("z", angle)
     return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
 
@@ -102,7 +108,8 @@ def turned_frame(runs: Sequence[Poses]) -> WorldTransform:
     for p in runs:
         own, true = matched(p)
         if len(own):
-            turns.append((rotations(true, p.manifold) * rotations(own, p.manifold).inv()).mean())
+            apart = rotations(true, p.manifold) * rotations(own, p.manifold).inv()
+            turns.append(apart.mean())
     if not turns:
         return IDENTITY
     turn = Rotation.concatenate(turns).mean()
@@ -115,7 +122,8 @@ def spread(runs: Sequence[Poses]) -> float:
     true = _positions(runs)[1]
     if not len(true):
         return 0.0
-    return float(np.sqrt(np.square(true - true.mean(axis=0)).sum(axis=1).mean()))
+    squares = np.square(true - true.mean(axis=0)).sum(axis=1)
+    return float(np.sqrt(squares.mean()))
 
 
 def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
@@ -157,10 +165,12 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
         if len(own):
             back = rotations(own, p.manifold).inv()
             turns.append((back * rotations(true, p.manifold)).mean())
-            arms.append(back.apply(positions(true, p.manifold) - positions(own, p.manifold)))
+            gap = positions(true, p.manifold) - positions(own, p.manifold)
+            arms.append(back.apply(gap))
     if not turns:
         return None
-    return BodyTransform(Rotation.concatenate(turns).mean(), np.concatenate(arms).mean(axis=0))
+    arm = np.concatenate(arms).mean(axis=0)
+    return BodyTransform(Rotation.concatenate(turns).mean(), arm)
 
 
 def on_body(p: Poses, body: BodyTransform) -> Poses:
@@ -175,11 +185,13 @@ def on_body(p: Poses, body: BodyTransform) -> Poses:
     shift = R.apply(body.arm)
     J = _jacobian(p.convention, R.as_matrix(), body)
     if p.manifold == "planar":
-        heading = wrap(own[:, 2] + body.turn.as_rotvec()[2])
-        estimate[finite] = np.column_stack([own[:, :2] + shift[:, :2], heading])
+        position = own[:, :2] + shift[:, :2]
+        turned = wrap(own[:, 2] + body.turn.as_rotvec()[2])
         J = submatrices(J, PLANE)
     else:
-        estimate[finite] = np.column_stack([own[:, :3] + shift, (R * body.turn).as_quat()])
+        position = own[:, :3] + shift
+        turned = (R * body.turn).as_quat()
+    estimate[finite] = np.column_stack([position, turned])
     covariance[finite] = J @ p.covariance[finite] @ np.swapaxes(J, 1, 2)
     return replace(p, estimate=estimate, covariance=covariance)
 

@@ -17,7 +17,8 @@ from consistency.referee.geometry.groups import inverse, matrices, vectors
 from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
-ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
+ALL_ORDERS = 4  # components up to which all orders are looked at
+SWAPS = 8  # and up to which swaps of two are
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
 SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
@@ -47,16 +48,20 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
         return list(_blocks(n))
     scales = [*_roots(part), *_singular(runs, axes, part)]
     if kind == "vector":
-        own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
-        return [*own, *_quaternion_states(runs, axes)]
+        covariances = _permuted(axes, len(axes))
+        states = _permuted(axes, len(axes), states=True)
+        return [*scales, *covariances, *states, *_quaternion_states(runs, axes)]
     of_covariance = *scales, *_permuted(axes, 3)
     if kind == "spatial":
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
-        half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
-        own = [*_orders(convention), *_quaternions(), *of_covariance, *_units(3, slice(3, 6)), half, *_positions(3)]
+        angles = slice(3, 6)
+        half = Guess(words, lambda p: _weighed(p, angles, 2.0), exact=True)
+        own = [*_orders(convention), *_quaternions(), *of_covariance]
+        own += [*_units(3, angles), half, *_positions(3)]
     else:
         sides = [kind for kind in PLANAR if kind not in (convention, "vector")]
-        own = [*map(_of_error, sides), *_headings(), *of_covariance, *_units(2, slice(2, 3)), *_positions(2)]
+        own = [*map(_of_error, sides), *_headings(), *of_covariance]
+        own += [*_units(2, slice(2, 3)), *_positions(2)]
     return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
 
 
@@ -79,7 +84,8 @@ def _blocks(n: int) -> Iterator[Guess]:
             if (np.diff(order) > 0).all():
                 continue
             text = ",".join(names[np.argsort(order)])
-            whole = (3 * order[:, None] + np.arange(3)).ravel().tolist()
+            components = 3 * order[:, None] + np.arange(3)
+            whole = components.ravel().tolist()
             words = f"the blocks of its covariance are in the order {text}; add --covariance-order {text}"
             yield Guess(words, _reordered(None, whole))
 
@@ -92,19 +98,25 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
         return
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
-        R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
+        correlations = P / sigma[:, :, None] / sigma[:, None, :]
+        R = np.median(correlations, axis=0)
     if not np.isfinite(R).all():
         return
     values, vectors = np.linalg.eigh(R)
     if values[0] > SINGULAR:
         return
-    v = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
+    v = vectors[:, 0]
+    v = v / v[np.argmax(np.abs(v))]
     direction = " ".join(f"{v[k]:+.2f} {axes[part[k]]}" for k in np.flatnonzero(np.abs(v) > 0.1))
     words = (
         f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations); "
         "look for lost digits or a correlation of 1"
     )
-    yield Guess(words, _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])))
+    yield Guess(words, _covariance(_without_cross_terms))
+
+
+def _without_cross_terms(P: Array) -> Array:
+    return np.asarray(_diagonal(P) * np.eye(P.shape[-1]))
 
 
 def _diagonal(P: Array) -> Array:
@@ -128,9 +140,11 @@ def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[G
     """Four components of a state that are a unit quaternion, which has three degrees of freedom."""
     for first in range(len(axes) - 3):
         four = slice(first, first + 4)
-        values = np.concatenate([np.concatenate([p.estimate, p.truth])[:, four] for p in runs])
+        states = [values for p in runs for values in (p.estimate, p.truth)]
+        values = np.concatenate(states)[:, four]
         values = values[finite_rows(values)]
-        if not len(values) or (np.abs(np.linalg.norm(values, axis=1) - 1.0) > UNIT).any():
+        lengths = np.linalg.norm(values, axis=1)
+        if not len(values) or (np.abs(lengths - 1.0) > UNIT).any():
             continue
         for w in (3, 0):
             order = {0: "w x y z", 3: "x y z w"}[w]
@@ -149,9 +163,14 @@ def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
         order = np.roll(order, -1)
     p = p.matched()
     turn = Rotation.from_quat(p.estimate[:, order])
-    small = (turn.inv() * Rotation.from_quat(p.truth[:, order])).as_rotvec()
+    true = Rotation.from_quat(p.truth[:, order])
+    small = (turn.inv() * true).as_rotvec()
     x, y, z, s = turn.as_quat().T
-    G = 2.0 * np.array([[s, z, -y, -x], [-z, s, x, -y], [y, -x, s, -z]])
+    G = 2.0 * np.array([
+        [s, z, -y, -x],
+        [-z, s, x, -y],
+        [y, -x, s, -z],
+    ])  # fmt: skip
     J = np.zeros((len(turn), len(rest) + 3, p.estimate.shape[1]))
     J[:, range(len(rest)), rest] = 1.0
     J[:, len(rest) :, order] = np.moveaxis(G, -1, 0)
@@ -176,7 +195,10 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
 def _positions(width: int) -> Iterator[Guess]:
     """Coordinates of the estimates of poses in another order, with the blocks of their covariance or without."""
     axes = "xyz"[:width]
-    turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
+    turned = rest = [2]
+    if width == 3:
+        turned = [3, 4, 5, 6]
+        rest = [3, 4, 5]
     for order, there in _other_orders(axes, width):
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
         yield Guess(f"the positions {words}", _reordered([*order, *turned]), fine=False)
@@ -188,10 +210,19 @@ def _other_orders(axes: Sequence[str], width: int) -> Iterator[tuple[list[int], 
     same = list(range(width))
     orders: Iterable[Iterable[int]] = itertools.permutations(same)
     if width > ALL_ORDERS:
-        orders = ([{i: j, j: i}.get(k, k) for k in same] for i, j in itertools.combinations(same, 2))
-    for order in map(list, orders if width <= SWAPS else ()):
+        orders = (_swapped(same, i, j) for i, j in itertools.combinations(same, 2))
+    if width > SWAPS:
+        return
+    for order in map(list, orders):
         if order != same:
             yield order, ", ".join(axes[order.index(slot)] for slot in same)
+
+
+def _swapped(order: Sequence[int], i: int, j: int) -> list[int]:
+    """An order with two of its places swapped."""
+    swapped = list(order)
+    swapped[i], swapped[j] = order[j], order[i]
+    return swapped
 
 
 def _reordered(
@@ -276,7 +307,11 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
     yield Guess(words, lambda p: _weighed(p, part, MILLI))
     remedy = "in millimetres; divide them by 1000"
     words = f"the positions of the estimates and their covariance are {remedy}"
-    yield Guess(words, lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI))
+
+    def both(p: Poses) -> Poses:
+        return _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI)
+
+    yield Guess(words, both)
     yield Guess(f"the positions of the estimates are {remedy}", _changed(["estimate"], shrunk))
     volume = width * float(np.log(MILLI))
     yield Guess(f"the positions of the truth are {remedy}", _changed(["truth"], shrunk), fine=False, volume=volume)

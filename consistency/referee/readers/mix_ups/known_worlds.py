@@ -22,7 +22,8 @@ from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 ARM = 1e-3  # of the size of the path: shorter lever arms are not named
-TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+TURN = 3.0  # degrees: frames that differ by less are not named
+SHIFT = 0.05  # of the size of the path
 
 
 def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
@@ -37,7 +38,8 @@ def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
 
 def _ned(convention: str) -> Iterator[Guess]:
     """A world whose z points down, with a body whose z does so too or not."""
-    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
+    swapped = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    north = WorldTransform(swapped, np.zeros(3))
     down = np.diag([1.0, -1.0, -1.0])
     turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
     T = np.eye(6)

@@ -11,9 +11,13 @@ from consistency.referee.geometry import wrap
 from consistency.referee.readers.truth_matching import Poses, finite_rows
 from consistency.referee.types import Array
 
-JUMP, SMOOTH, OFTEN = 180.0, 60.0, 3  # degrees between rows, and what is left less a whole turn; no rad jump as often
-TURNING, ALONG = 0.15, 0.2  # rad, spread of a course; the part of it that headings in degrees do not explain, at most
-STANDING, FEWEST = 1e-6, 10  # m between two rows; steps along a path
+JUMP = 180.0  # degrees between two rows
+SMOOTH = 60.0  # degrees that are left of a jump less a whole turn
+OFTEN = 3  # jumps: headings in rad do not jump as often
+TURNING = 0.15  # rad, spread of a course
+ALONG = 0.2  # the part of it that headings in degrees do not explain, at most
+STANDING = 1e-6  # m between two rows
+FEWEST = 10  # steps along a path
 FITTING = (0.05, 4.0)  # median of squared errors over variances, of which chi-square has 0.45
 
 
@@ -33,8 +37,9 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
         beyond = False
         for p in runs:
             values = getattr(p, name)
-            poses.append(values[finite_rows(values)])
-            beyond |= bool((np.abs(poses[-1][:, 2]) > 2.0 * np.pi + 0.1).any())
+            finite = values[finite_rows(values)]
+            poses.append(finite)
+            beyond |= bool((np.abs(finite[:, 2]) > 2.0 * np.pi + 0.1).any())
         if beyond and jumps([each[:, 2] for each in poses]):
             why = "jump by a whole turn of 360"
         elif turn_in_degrees(poses):
@@ -75,7 +80,8 @@ def turn_in_degrees(poses: Sequence[Array]) -> bool:
         if not moving.any():
             continue
         course = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
-        apart = np.unwrap(wrap(np.deg2rad(each[:-1, 2][moving]) - course))
+        heading = np.deg2rad(each[:-1, 2][moving])
+        apart = np.unwrap(wrap(heading - course))
         turning += course.var() * len(course)
         unexplained += apart.var() * len(course)
         steps += len(course)
@@ -87,11 +93,14 @@ def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     gaps = []
     variances = []
     for p in runs:
-        known = p.known()
-        gaps.append(known.truth[:, 2] - p.estimate[known.rows, 2])
-        variances.append(p.covariance[known.rows, 2, 2])
+        known = p.matched()
+        gaps.append(known.truth[:, 2] - known.estimate[:, 2])
+        variances.append(known.covariance[:, 2, 2])
     gap = np.concatenate(gaps)
     variance = np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)
-    ratio = np.square(gap[some] - 360.0 * np.round(gap[some] / 360.0)) / variance[some]
-    return 2 * len(ratio) > len(gap) and bool(FITTING[0] < np.median(ratio) < FITTING[1])
+    error = gap[some] - 360.0 * np.round(gap[some] / 360.0)
+    ratio = np.square(error) / variance[some]
+    if 2 * len(ratio) <= len(gap):
+        return False
+    return bool(FITTING[0] < np.median(ratio) < FITTING[1])

@@ -131,7 +131,8 @@ def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
             if values is None:
                 continue
             if arrays[key] is None:
-                arrays[key] = np.full((len(tracks), steps, *values.shape[1:]), np.nan)
+                shape = (len(tracks), steps, *values.shape[1:])
+                arrays[key] = np.full(shape, np.nan)
             arrays[key][row, track.column] = values
     arrays["times"] = arrays.pop("t")
     return arrays
@@ -160,7 +161,9 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
     for track in tracks:
         if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
             continue
-        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
+        error = np.ascontiguousarray(track.error)
+        digest = hashlib.sha256(error.tobytes()).digest()
+        other = seen.setdefault(digest, track)
         if other is not track:
             raise InputError(
                 f"{file}: the runs that start at {other.place[0]} and {track.place[0]} are identical; "
@@ -178,7 +181,9 @@ def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool
     if one_triangle:
         upper = np.triu(covariance, 1).any(axis=(1, 2))
         lower = np.tril(covariance, -1).any(axis=(1, 2))
-        one_triangle = bool((upper.all() and not lower.any()) or (lower.all() and not upper.any()))
+        is_upper = upper.all() and not lower.any()
+        is_lower = lower.all() and not upper.any()
+        one_triangle = bool(is_upper or is_lower)
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
@@ -247,7 +252,9 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    arrays: dict[str, Any] = {key: at(getattr(track, key), slice(end)) for key in ("column", "t", *ARRAYS)}
+    arrays: dict[str, Any] = {}
+    for key in ("column", "t", *ARRAYS):
+        arrays[key] = at(getattr(track, key), slice(end))
     track = replace(track, place=track.place.at(slice(end)), **arrays)
     error = track.error
     P = track.covariance
@@ -256,7 +263,8 @@ def _cut(track: Track, start: int, end: int) -> Track:
     values = np.full(end, np.nan)
     values[start:] = nees(error[start:], P[start:])
     if start:
-        P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+        unknown = np.full_like(P[:start], np.nan)
+        P = np.concatenate([unknown, P[start:]])
     return replace(track, covariance=P, nees=values)
 
 
@@ -272,7 +280,8 @@ def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indice
     variance = np.concatenate(variances)
     variance = variance[~np.isnan(variance).any(axis=1)]
     still = ~(np.abs(np.concatenate(errors)) > NO_ERROR).any(axis=0)
-    idle: Indices = still & (variance == variance[:1]).all(axis=0) & (len(variance) > 1)
+    constant = (variance == variance[:1]).all(axis=0)
+    idle: Indices = still & constant & (len(variance) > 1)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
     return np.zeros(len(idle), bool) if still.all() or none.any() else idle
 
@@ -281,7 +290,8 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     """Message that no covariance has full rank, and what to judge in place of all components."""
     P = np.concatenate([track.covariance for track in tracks if track.covariance is not None])
     errors = np.concatenate([track.error for track in tracks if track.error is not None])
-    none = (np.abs(np.diagonal(P, axis1=-2, axis2=-1)) <= ROUNDED.zero).all(axis=0)
+    variances = np.abs(np.diagonal(P, axis1=-2, axis2=-1))
+    none = (variances <= ROUNDED.zero).all(axis=0)
     still = ~(np.abs(errors) > NO_ERROR).any(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"

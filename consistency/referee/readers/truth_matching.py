@@ -51,7 +51,8 @@ def common_times(times: Sequence[Array]) -> tuple[list[Indices], Array]:
     for own in times:
         near = np.clip(np.searchsorted(longest, own - ROUNDING), 0, len(longest) - 1)
         if (np.abs(longest[near] - own) > ROUNDING).any():
-            return [np.arange(len(each)) for each in times], np.full(len(longest), np.nan)
+            counted = [np.arange(len(each)) for each in times]
+            return counted, np.full(len(longest), np.nan)
         columns.append(near.astype(np.int64))
     return columns, longest
 
@@ -94,24 +95,30 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     after = np.minimum(before + 1, last)
     gap = reference[after] - reference[before]
     inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
-    apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
+    to_before = np.abs(times - reference[before])
+    to_after = np.abs(times - reference[after])
+    apart = np.minimum(to_before, to_after)
     rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
     before = before[rows]
     after = after[rows]
     gap = gap[rows]
     inside = inside[rows]
     apart = apart[rows]
-    share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
-    later = ~inside & (np.abs(times[rows] - reference[after]) < np.abs(times[rows] - reference[before]))
-    truth = _between(values[np.where(later, after, before)], values[after], share, manifold)
-    bend = _bends(values[:, : 2 if manifold == "planar" else 3], before) * 4.0 * share * (1.0 - share)
+    since = times[rows] - reference[before]
+    share = np.where(inside, since / np.where(gap > 0, gap, 1.0), 0.0)
+    later = ~inside & (to_after[rows] < to_before[rows])
+    start = values[np.where(later, after, before)]
+    truth = _between(start, values[after], share, manifold)
+    width = 2 if manifold == "planar" else 3
+    bend = _bends(values[:, :width], before) * 4.0 * share * (1.0 - share)
     return Known(rows, truth, before, apart, bend)
 
 
 def nearest(times: Array, reference: Array, before: Indices) -> Indices:
     """The nearest sample to each of ``times`` (k,), from the one at or before it."""
     after = np.minimum(before + 1, len(reference) - 1)
-    return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
+    is_later = np.abs(times - reference[after]) < np.abs(times - reference[before])
+    return np.where(is_later, after, before)
 
 
 def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:
@@ -126,8 +133,10 @@ def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Arra
     if manifold == "spatial" and len(turned):
         from scipy.spatial.transform import Rotation  # half of what a planar log would load
 
-        first, second = (Rotation.from_quat(values[turned, 3:7]) for values in (start, end))
-        turn = Rotation.from_rotvec(share[turned, None] * (first.inv() * second).as_rotvec())
+        first = Rotation.from_quat(start[turned, 3:7])
+        second = Rotation.from_quat(end[turned, 3:7])
+        way = (first.inv() * second).as_rotvec()
+        turn = Rotation.from_rotvec(share[turned, None] * way)
         out[turned, 3:7] = (first * turn).as_quat()
     out[share == 0.0] = start[share == 0.0]
     return np.asarray(out)
@@ -139,7 +148,8 @@ def _bends(position: Array, after: Indices) -> Array:
     if last < 1:
         return np.zeros(len(after))
     second = np.linalg.norm(np.diff(position, 2, axis=0), axis=1)  # of samples 1, 2, ...
-    before, behind = (second[np.clip(after + side, 1, last) - 1] for side in (0, 1))
+    before = second[np.clip(after, 1, last) - 1]
+    behind = second[np.clip(after + 1, 1, last) - 1]
     return np.asarray(np.maximum(before, behind) / 8.0)
 
 
@@ -182,8 +192,9 @@ class Poses:
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
         if self.true_t is self.t and not shift:  # beside the estimates
-            none = np.zeros(len(self.t))
-            return Known(np.arange(len(self.t)), self.truth, np.arange(len(self.t)), none, none)
+            rows = np.arange(len(self.t))
+            none = np.zeros(len(rows))
+            return Known(rows, self.truth, rows, none, none)
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
 
     def matched(self, shift: float = 0.0) -> Poses:
@@ -259,14 +270,18 @@ class Poses:
         """At most ``most`` estimates, evenly chosen."""
         if len(self.t) <= most:
             return self
-        return self.of_rows(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+        places = np.linspace(0, len(self.t) - 1, most)
+        return self.of_rows(np.unique(places.astype(int)))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
         if self.manifold != "spatial" or self.covariance.shape[-1] == 6:
             return self
         return replace(
-            self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
+            self,
+            estimate=self.estimate[:, :7],
+            covariance=self.covariance[:, :6, :6],
+            truth=self.truth[:, :7],
         )
 
     def of_rows(self, rows: Indices) -> Poses:
@@ -321,9 +336,8 @@ WHOLE = Stated()
 ALONE = Stated(alone=True)
 POINTS = Stated({"": slice(3)})  # positions without orientations
 BLOCKS = Stated({" position": slice(3), " rotation": slice(3, 6)})
-SINGLE = Stated(
-    {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)} | {" velocity and biases": slice(6, None)}, alone=True
-)
+_EACH = {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)}
+SINGLE = Stated({**_EACH, " velocity and biases": slice(6, None)}, alone=True)
 
 
 @dataclass(frozen=True)

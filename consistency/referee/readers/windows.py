@@ -119,7 +119,8 @@ def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: s
         if not np.isfinite(t[rows]).all():
             raise InputError(f"{file}: {relative.flag} {relative.option} needs a column t, in s")
         return t[rows]
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    return np.append(0.0, np.cumsum(steps))
 
 
 def _none(place: Array, relative: Relative, file: str) -> str:

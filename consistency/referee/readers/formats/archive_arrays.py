@@ -117,7 +117,8 @@ class Archive:
         if "lengths" not in self:
             return [steps] * runs
         lengths = np.atleast_1d(self.arrays["lengths"])
-        if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
+        are_whole = lengths.shape == (runs,) and lengths.dtype.kind in "iu"
+        if not are_whole or lengths.min() < 1 or lengths.max() > steps:
             raise InputError(f"{self.path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
         return [int(length) for length in lengths]
 
@@ -140,7 +141,8 @@ class Archive:
             raise InputError(f"{self.path}: key 'nis' has shape {nis.shape}, needs {shape}")
         dof = self.whole_numbers("nis_dof", shape)
         known = np.isfinite(nis)
-        if (nis < 0).any() or np.isinf(nis).any() or not are_dof(dof[known]).all():
+        is_bad = (nis < 0) | np.isinf(nis)
+        if is_bad.any() or not are_dof(dof[known]).all():
             needed = "nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
             raise InputError(f"{self.path}: keys 'nis', 'nis_dof': {needed}")
         return nis, np.where(known, dof, 0.0)
@@ -150,7 +152,8 @@ class Archive:
         if "t" not in self:
             return np.full(steps, np.nan)
         t = self.arrays["t"]
-        if t.shape != (steps,) or t.dtype.kind not in "fiu" or not (np.diff(t) > 0).all():
+        are_numbers = t.shape == (steps,) and t.dtype.kind in "fiu"
+        if not are_numbers or not (np.diff(t) > 0).all():
             raise InputError(f"{self.path}: key 't' must be {steps} increasing numbers, in s")
         return np.asarray(t, float)
 
@@ -198,8 +201,12 @@ def load_matlab(path: Path) -> dict[str, Array]:
         if file.read(len(HDF5)) == HDF5:
             raise InputError(f"{path}: is of MATLAB 7.3; write it with save(..., '-v7')")
     with reading(path):
-        require_room(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)))
-        arrays = {key: _array(key, value) for key, value in loadmat(path).items() if not key.startswith("__")}
+        sizes = [int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)]
+        require_room(path, 8 * sum(sizes))
+        arrays = {}
+        for key, value in loadmat(path).items():
+            if not key.startswith("__"):
+                arrays[key] = _array(key, value)
     P = arrays.get("covariances")
     if P is None or P.ndim > 2:
         return arrays

@@ -28,8 +28,10 @@ from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import finite_rows
 from consistency.referee.types import Array, Indices
 
-POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
-FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+POSE = 8  # columns of a pose
+SPLIT = 20  # of a pose and two 3 x 3 covariances without a cross-covariance
+FULL = 36  # numbers of a 6 x 6 covariance row by row
+TRIANGLE = 21  # of its upper triangle
 POINT = 4  # columns of a truth of positions alone: t, x, y, z
 DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
 DEVIATED = POSE + 6  # columns of a pose and six standard deviations
@@ -104,11 +106,11 @@ def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Colu
     if "run" in sheet or "filter" in sheet:
         raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
     names = head.names
-    pose = (*found.position, *found.quaternion)
-    require_units([names[place] for place in (*found.clock.places, *pose, *found.covariance, *found.rest)], path)
 
     def numbers(places: Sequence[int]) -> list[Array]:
-        return [sheet.numbers(names[place]) for place in places]
+        columns = [names[place] for place in places]
+        require_units(columns, path)
+        return list(map(sheet.numbers, columns))
 
     t, unit = times_of(sheet, found.clock, numbers(found.clock.places))
     stated = numbers(found.covariance)
@@ -117,7 +119,8 @@ def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Colu
     rest = None
     if found.rest:
         rest = np.column_stack(numbers(found.rest))
-    values = np.column_stack([t, *numbers(pose), *stated])
+    pose = numbers(found.position + found.quaternion)
+    values = np.column_stack([t, *pose, *stated])
     note = _named_note(path, head, found, true, UNIT_NAMES[unit])
     return increasing(Lines(path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut))
 
@@ -180,7 +183,8 @@ def _asl(lines: Lines, true: bool) -> Lines:
     t, unit = times_of(lines, Clock((0,), None), [lines.t])
     of = "truth" if true else "poses"
     note = f"{lines.path}: read as EuRoC {of}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
-    values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
+    pose = lines.values[:, [1, 2, 3, 5, 6, 7, 4]]
+    values = np.column_stack([t, pose])
     return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
 
 
@@ -195,7 +199,8 @@ def _are_rigid(numbers: Array) -> Indices:
     M = numbers.reshape(len(numbers), -1, 4)
     right = are_rotations(M[:, :3, :3])
     if M.shape[1] == 4:
-        right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < TOLERANCE
+        off = np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0])
+        right &= off.max(axis=1) < TOLERANCE
     return np.asarray(right | ~finite_rows(numbers))
 
 
@@ -209,7 +214,8 @@ def _matrices(lines: Lines) -> Lines:
     quaternion = quaternions(M[:, :3, :3])
     quaternion[~finite_rows(numbers)] = np.nan
     note = f"{lines.path}: read as matrices of {M.shape[1]} x 4, {lines.values.shape[1]} columns, {clock}"
-    return increasing(replace(lines, values=np.column_stack([t, M[:, :3, 3], quaternion, covariance]), note=note))
+    values = np.column_stack([t, M[:, :3, 3], quaternion, covariance])
+    return increasing(replace(lines, values=values, note=note))
 
 
 def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
@@ -279,4 +285,5 @@ def _has_cameras(values: Array, column: int, each: int) -> bool:
     """Whether a column holds a number of cameras, of which there are so many numbers each in the columns behind it."""
     cameras = values[:, column]
     width = column + 1 + each * cameras
-    return bool(((cameras >= 1) & (cameras == np.round(cameras)) & (width <= values.shape[1])).all())
+    are_numbers = (cameras >= 1) & (cameras == np.round(cameras))
+    return bool((are_numbers & (width <= values.shape[1])).all())

@@ -21,8 +21,10 @@ from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
 FEWEST = 3  # estimates of a run
-TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is not an error of a constant orientation
-WINDING, ALIGNED = 0.01, 0.25  # 1 less the mean direction of a path, and the part of it that is left in the body's axes
+TURNED = 0.5  # rad: a turn that is not an error of a constant orientation
+BEYOND = 10.0  # sigma, likewise
+WINDING = 0.01  # 1 less the mean direction of a path
+ALIGNED = 0.25  # the part of it that is left in the body's axes
 
 
 def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
@@ -109,13 +111,19 @@ def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
     turns = [turn for one in poses if (turn := _turning(one)) is not None]
     if not turns or np.median([turn[0] for turn in turns]) < TURNED:
         return False, ""
-    angle, of_way, of_body = np.transpose(turns)
+    angle, *lengths = np.transpose(turns)
     text = "the truth has the same orientation in every row, while the estimates turn by"
     text = f"{text} {np.rad2deg(np.median(angle)):.0f} degrees"
-    way, body = (1.0 - np.nanmean(each) if np.isfinite(each).any() else 0.0 for each in (of_way, of_body))
+    way, body = map(_winding, lengths)
     if way > WINDING and body < ALIGNED * way:
         return True, f"{text} with the path: it is read as positions alone"
     return False, f"{text}; if it is a placeholder, give a truth of t x y z, or judge --axes x,y,z"
+
+
+def _winding(lengths: Array) -> float:
+    """1 less the mean length of mean directions; 0 where nothing moves."""
+    known = lengths[np.isfinite(lengths)]
+    return 1.0 - float(known.mean()) if len(known) else 0.0
 
 
 def _turning(one: Poses) -> tuple[float, float, float] | None:
@@ -131,7 +139,8 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
     if len(rows) < FEWEST:
         return None
     R = Rotation.from_quat(one.estimate[rows, 3:7])
-    sigma = np.sqrt(np.abs(np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)))
+    variance = np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)
+    sigma = np.sqrt(np.abs(variance))
     turned = (R[0].inv() * R).magnitude()
     turn = float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0)))
     way = np.diff(true, axis=0)
@@ -141,7 +150,8 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
         return turn, np.nan, np.nan
     way = way[moving] / size[moving, None]
     in_body = R[:-1][moving].inv().apply(way)
-    return turn, float(np.linalg.norm(way.mean(axis=0))), float(np.linalg.norm(in_body.mean(axis=0)))
+    of_way = float(np.linalg.norm(way.mean(axis=0)))
+    return turn, of_way, float(np.linalg.norm(in_body.mean(axis=0)))
 
 
 def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:

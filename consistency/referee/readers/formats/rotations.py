@@ -15,7 +15,8 @@ UNIT = 1e-3  # of the length of a quaternion: four decimals pass
 def are_rotations(R: Array) -> Indices:
     """Whether matrices (..., 3, 3) are rotations, (...) of bool; no matrix that is not finite is."""
     with np.errstate(invalid="ignore", over="ignore"):
-        off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+        product = R @ np.swapaxes(R, -1, -2)
+        off = np.abs(product - np.eye(3)).max(axis=(-2, -1))
         return np.asarray((off < TOLERANCE) & (np.linalg.det(R) > 0))
 
 
@@ -32,4 +33,5 @@ def quaternions(R: Array) -> Array:
 def not_unit(pose: Array) -> tuple[Indices, Array]:
     """Which finite poses x, y, z, qx, qy, qz, qw (N, 7) have quaternions of another length than 1; all lengths (N,)."""
     length = np.linalg.norm(pose[:, 3:], axis=1)
-    return np.asarray(finite_rows(pose) & (np.abs(length - 1.0) > UNIT)), length
+    bad = finite_rows(pose) & (np.abs(length - 1.0) > UNIT)
+    return np.asarray(bad), length

@@ -87,8 +87,13 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     stated_as.require_spatial(r.error, INERTIAL)
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
-    runs = (SpaceRun(read_trajectory(own, columns=r.columns), truth_of(true), (own, true), P) for own, true, P in files)
+    runs = (_run_of(own, true, P, truth_of, r) for own, true, P in files)
     return [poses_of(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
+
+
+def _run_of(own: Path, true: Path, covariance: Path | None, truth_of: Callable[[Path], Lines], r: Reading) -> SpaceRun:
+    lines = read_trajectory(own, columns=r.columns)
+    return SpaceRun(lines, truth_of(true), (own, true), covariance)
 
 
 class Layout(NamedTuple):
@@ -112,7 +117,8 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     layout: Layout | None = None
     for run in runs:
         own, true, world = localised(run.own, run.true)
-        notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
+        notes += [own.cut, true.cut, own.note, true.note, world]
+        notes += [_unused(true, r), *run.notes]
         if layout is None:
             layout = _layout_of(own, run.files, r)
             notes.append(stated_as.order_note(run.files[0], stated_as.components_of(own), r))
@@ -278,7 +284,8 @@ def _covariances(
     """
     P = stated_as.covariances_in(own, order)
     if path is None and P is not None:
-        return symmetric(P[:, :n, :n], own.place, one_triangle=True), np.ones(len(P), bool), None
+        covariance = symmetric(P[:, :n, :n], own.place, one_triangle=True)
+        return covariance, np.ones(len(P), bool), None
     if path is None:
         of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
         if isinstance(own, States):
@@ -297,7 +304,8 @@ def _covariances(
     cross = None
     if source.values.shape[1] == 1 + stated_as.BOTH:
         cross = stated_as.cross_covariances(own, source, rows, picked, order)
-    return stated_as.on_rows(len(known), rows, P[picked][:, :n, :n], source, picked), known, cross
+    covariance = stated_as.on_rows(len(known), rows, P[picked][:, :n, :n], source, picked)
+    return covariance, known, cross
 
 
 def _states(lines: Lines, k: int) -> Array:

@@ -97,7 +97,8 @@ def _judged(e: Estimator, r: Reading) -> list[int]:
     else:
         judged = list(range(len(e.axes)))
     if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
-        judged = [i for i in judged if i < len(AXES) or any(p.covariance[:, i, i].any() for p in e.runs)]
+        stated = np.any([_variances(p).any(axis=0) for p in e.runs], axis=0)
+        judged = [i for i in judged if i < len(AXES) or stated[i]]
     return judged
 
 
@@ -212,8 +213,8 @@ def _is_cut(p: Poses, whole: Poses) -> bool:
     if len(p.t) < 2 or p.t[-1] != whole.t[-1]:
         return False
     before, last = classify(p.covariance[-2:], ROUNDED)
-    finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
-    return bool(finite and before == Validity.VALID and last != Validity.VALID)
+    is_finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
+    return bool(is_finite and before == Validity.VALID and last != Validity.VALID)
 
 
 # --- what is found -----------------------------------------------------------------------------------
@@ -265,7 +266,9 @@ def _bent(p: Poses) -> Array:
     assert p.bend is not None
     sigma = np.sqrt(np.abs(_variances(p)[:, :3]).mean(axis=1))
     bent = np.zeros(len(sigma))
-    return np.asarray(np.divide(p.bend, sigma, out=bent, where=(sigma > 0) & (p.bend > 1e-9)))
+    some = (sigma > 0) & (p.bend > 1e-9)
+    bent[some] = p.bend[some] / sigma[some]
+    return bent
 
 
 def _variances(p: Poses) -> Array:
@@ -329,7 +332,8 @@ def _track(e: Estimator, p: Poses, error: Array) -> Track:
     path = t = None
     width = e.position
     if width:
-        path = np.stack([p.truth[:, :width], p.estimate[:, :width]], axis=1)
+        true = p.truth[:, :width]
+        path = np.stack([true, p.estimate[:, :width]], axis=1)
     if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
         t = p.seconds
     return Track(
@@ -383,10 +387,20 @@ def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        error = np.where(finite_rows(p.estimate), 0.0, np.nan)[:, None]
-        tracks.append(Track(p.run, np.arange(len(p.t)), p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
+        error = np.where(finite_rows(p.estimate), 0.0, np.nan)
+        track = Track(
+            p.run,
+            np.arange(len(p.t)),
+            p.place,
+            error[:, None],
+            nis=p.nis,
+            nis_dof=p.nis_dof,
+            t=p.clock,
+        )
+        tracks.append(track)
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])
+    notes = [*e.notes, *numbering]
+    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
     return replace(record, error=None, dof=0)
 
 
@@ -413,4 +427,5 @@ def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative
     record = relative_recording(e.name, str(e.covariances or e.path), runs, axes, judged, relative)
     causes = causes_of_motions(e.said, runs, axes, judged, relative)
     left_out = _left_out(e, runs, [p.matched() for p in runs])
-    return replace(record, notes=(*e.notes, *left_out, *record.notes, *causes), causes=tuple(causes))
+    notes = (*e.notes, *left_out, *record.notes, *causes)
+    return replace(record, notes=notes, causes=tuple(causes))

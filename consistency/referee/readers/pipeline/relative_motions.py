@@ -84,15 +84,24 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
         broken = 0.0
         if not np.isfinite(p.estimate[sound]).all():
             broken = np.nan
-        error = np.concatenate([error, np.full((1, error.shape[1]), broken)])
-        covariance = np.concatenate([covariance, np.full((1, *p.covariance.shape[1:]), np.nan)])
-    track = Track(p.run, np.arange(len(last)), p.place.at(last), error, covariance, t=t[first], by=at(p.by, first))
+        error = np.vstack([error, np.full(error.shape[1], broken)])
+        unknown = np.full((1, *p.covariance.shape[1:]), np.nan)
+        covariance = np.concatenate([covariance, unknown])
+    track = Track(
+        p.run,
+        np.arange(len(last)),
+        p.place.at(last),
+        error,
+        covariance,
+        t=t[first],
+        by=at(p.by, first),
+    )
     return Windows(track, error, covariance, t[last], left_out)
 
 
 def _sound(p: Poses, relative: Relative) -> int:
     """The first row that is broken; the first row of motions is only where they start."""
-    ok: Array = np.asarray(finite_rows(p.estimate) & finite_rows(p.covariance))
+    ok = finite_rows(p.estimate) & finite_rows(p.covariance)
     if p.cross is not None:
         ok[1:] &= finite_rows(p.cross[1:])
     if relative.motions:
@@ -127,7 +136,8 @@ def _of_poses(p: Poses, T: Array, D: Array, first: Indices, last: Indices, relat
     end = to_left(T[last], p.convention)
     J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
     cross = p.cross[last]
-    joint = np.block([[p.covariance[first], cross], [np.swapaxes(cross, -1, -2), p.covariance[last]]])
+    mirrored = np.swapaxes(cross, -1, -2)
+    joint = np.block([[p.covariance[first], cross], [mirrored, p.covariance[last]]])
     return propagated(J, joint)
 
 
@@ -253,7 +263,8 @@ def causes_of_motions(
     for p in runs:
         known = p.known()
         most = slice(SEARCHED // len(runs))
-        some.append(replace(p, true_t=p.t[known.rows[most]], truth=known.truth[most], true_covariance=None, max_dt=0.0))
+        t = p.t[known.rows[most]]
+        some.append(replace(p, true_t=t, truth=known.truth[most], true_covariance=None, max_dt=0.0))
 
     def errors_without(change: Change) -> Pairs:
         found = []

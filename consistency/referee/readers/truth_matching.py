@@ -22,6 +22,7 @@ REST = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # velocity,
 STATE = (*AXES, *REST)
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
+Files = tuple[Path | str, Path | str]  # of the estimates, of the truth
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
 
 
@@ -178,7 +179,7 @@ class Poses:
     true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
     run: int = 0
     name: str = ""  # of a drive
-    files: tuple[Path | str, Path | str] = ("the estimates", "the truth")
+    files: Files = ("the estimates", "the truth")
     numbered: bool = False  # t are numbers of steps
     clock: Array | None = None  # (N,), s, where t are numbers of steps
     true_clock: Array | None = None  # (M,), s

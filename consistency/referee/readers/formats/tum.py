@@ -50,6 +50,7 @@ from consistency.referee.readers.truth_matching import (
     STATE,
     WHOLE,
     Estimator,
+    Files,
     Poses,
     Stated,
     finite_rows,
@@ -66,7 +67,7 @@ class SpaceRun:
 
     own: Lines
     true: Lines
-    files: tuple[Path | str, Path | str]  # of the estimates, of the truth
+    files: Files  # of the estimates, of the truth
     covariance: Path | None = None  # where it is not in the lines
     notes: Sequence[str] = ()
 
@@ -101,7 +102,7 @@ class Layout(NamedTuple):
 
     stated: Stated
     convention: str  # of the error of poses; "" of positions by satellite
-    files: tuple[Path | str, Path | str]  # of the first run
+    files: Files  # of the first run
 
 
 def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str = "", mixed: str = "") -> Estimator:
@@ -165,7 +166,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     )
 
 
-def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
+def _layout_of(own: Lines, files: Files, r: Reading) -> Layout:
     """The layout of the first run.
 
     Raises

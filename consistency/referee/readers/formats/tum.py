@@ -216,30 +216,12 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
         A file holds positions alone.
     """
     poses = []
-    pose = slice(1, POSE)
     for run in runs:
-        own = run.own
-        true = run.true
-        for lines, name in zip((own, true), run.files, strict=True):
+        for lines, name in zip((run.own, run.true), run.files, strict=True):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        covariance, stated = unstated(len(own.t), 6)
-        poses.append(
-            Poses(
-                place=own.places,
-                t=own.t,
-                estimate=own.values[:, pose],
-                covariance=covariance,
-                stated=stated,
-                true_t=true.t,
-                truth=true.values[:, pose],
-                manifold="spatial",
-                convention="left",
-                max_dt=r.tolerance,
-                name=own.path.stem,
-                files=run.files,
-            )
-        )
+        covariance, stated = unstated(len(run.own.t), 6)
+        poses.append(_poses(run, 0, covariance, stated, "left", r))
     return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
 
 
@@ -256,24 +238,32 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     order = r.covariance_order or ORDERS[0]
     P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
     of_truth = _of_truth(true, own, order, r)
-    own = own.of(slice(0, POSE))
-    poses = Poses(
-        place=own.places,
-        t=own.t,
-        estimate=_states(own, k),
-        covariance=P,
-        stated=known,
-        true_t=true.t,
-        truth=_states(true, k),
-        manifold="spatial",
-        convention=layout.convention,
-        max_dt=r.tolerance,
-        cross=cross,
-        true_covariance=of_truth,
-    )
+    run = replace(run, own=own.of(slice(0, POSE)))  # without the covariances, of which P has a copy
+    poses = _poses(run, k, P, known, layout.convention, r)
+    poses = replace(poses, cross=cross, true_covariance=of_truth)
     if _is_point(true):
         poses = positions(poses, r.lever_arm, layout.stated != WHOLE)
     return poses, note
+
+
+def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: str, r: Reading) -> Poses:
+    """Poses beside the true ones, both with the first ``k`` numbers of velocity and biases behind them."""
+    own = run.own
+    true = run.true
+    return Poses(
+        place=own.places,
+        t=own.t,
+        estimate=_states(own, k),
+        covariance=covariance,
+        stated=stated,
+        true_t=true.t,
+        truth=_states(true, k),
+        manifold="spatial",
+        convention=convention,
+        max_dt=r.tolerance,
+        name=own.path.stem,
+        files=run.files,
+    )
 
 
 def _covariances(

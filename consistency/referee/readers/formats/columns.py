@@ -25,11 +25,16 @@ from consistency.referee.readers.formats.spellings import (
 # --- states of a table -------------------------------------------------------------------------------
 
 
+def is_pose(axes: Sequence[str]) -> bool:
+    """Whether a state is a pose in the plane: x, y, heading."""
+    return list(axes) == POSE
+
+
 def state_columns(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:
     """Places of the components of a state that are there, under their own names or spelled like ``est_{}``."""
     once = places_of(names)
     words_of = [(plain_name(axis),) for axis in axes]
-    if tuple(axes) == tuple(POSE):
+    if is_pose(axes):
         words_of = list(known.PLANE)
     found = {}
     for axis, words in zip(axes, words_of, strict=True):
@@ -70,7 +75,7 @@ class Entries(NamedTuple):
 
 def entry_name(axes: Sequence[str], i: int, j: int) -> str:
     """Name of an entry of a covariance in docs/files.md: ``P_a_b``, or ``P_xh`` of poses in the plane."""
-    if tuple(axes) == tuple(POSE):
+    if is_pose(axes):
         return f"P_{'xyh'[i]}{'xyh'[j]}"
     return f"P_{axes[i]}_{axes[j]}"
 
@@ -84,7 +89,7 @@ def covariance_columns(names: Sequence[str], axes: Sequence[str]) -> Entries:
     once = places_of(names)
     diagonal = {(i, i) for i in range(len(axes))}
     own = _entries(exact, axes, "P_{}_{}")
-    if tuple(axes) == tuple(POSE):
+    if is_pose(axes):
         own = _entries(exact, "xyh", "P_{}{}") | own
     if diagonal <= set(own):
         return Entries(own)
@@ -131,7 +136,7 @@ def _entries(places: Mapping[str, int], words: Sequence[str], spelling: str) -> 
 def _state_labels(axes: Sequence[str]) -> list[tuple[str, ...]]:
     """Words for the components in names of a covariance: their own, or numbers from 1 or 0 on."""
     labels = [tuple(plain_names(axes))]
-    if labels[0] == tuple(POSE):
+    if is_pose(labels[0]):
         labels = [("x", "y", heading) for heading in (*known.HEADINGS, *known.SHORT_HEADINGS)]
     for first in (1, 0):
         labels.append(tuple(map(str, range(first, first + len(axes)))))

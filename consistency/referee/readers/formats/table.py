@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.column_names import POSE as POSE_NAMES
+from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns
-from consistency.referee.readers.formats.columns import covariance_columns
+from consistency.referee.readers.formats.columns import covariance_columns, is_pose
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
@@ -32,8 +32,6 @@ from consistency.referee.readers.truth_matching import (
     unstated,
 )
 from consistency.referee.types import Array
-
-POSE = tuple(POSE_NAMES)
 
 
 def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = False) -> list[Estimator]:
@@ -106,7 +104,7 @@ def _sheet(
         from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         sheet = drive_sheet(table, body)
-    elif axes == POSE:
+    elif is_pose(axes):
         sheet, note = planar_sheet(table, motions, renaming)
     else:
         sheet = read_sheet(table, renaming)
@@ -135,7 +133,7 @@ def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = N
 def _convention(convention: str | None, axes: tuple[str, ...], truth: TableRows | None) -> str:
     if convention is not None and truth is None:
         raise InputError("--error needs --truth: without truth there is no error")
-    if axes == POSE:
+    if is_pose(axes):
         if convention not in (None, *PLANAR):
             raise InputError(f"--error {convention}: for x, y, heading it is one of {', '.join(PLANAR)}")
         return convention or "so2"
@@ -150,7 +148,7 @@ def _require_truth(
     """Refuse options that need a truth, or poses, where there are none."""
     if r.relative is not None and truth is None:
         raise InputError(f"{sheet.path}: --relative needs --truth FILE, poses in any world")
-    if r.relative is not None and (axes != POSE or convention == "vector"):
+    if r.relative is not None and (not is_pose(axes) or convention == "vector"):
         raise InputError(f"{sheet.path}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and convention == "vector":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
@@ -308,7 +306,7 @@ def _position(axes: Sequence[str]) -> int:
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:
     """Covariances (N, n, n), which of them are stated, and a note on them."""
-    if convention != ADDITIVE and axes == POSE:
+    if convention != ADDITIVE and is_pose(axes):
         own = columns.own_covariance(sheet)
         if own is not None:
             note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"

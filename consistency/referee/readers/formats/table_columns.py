@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.column_names import OWN_COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.readers.clock_units import unit_of
-from consistency.referee.readers.formats.columns import Entries, covariance_columns, entry_name, state_columns
+from consistency.referee.readers.formats.columns import Entries, covariance_columns, entry_name, is_pose, state_columns
 from consistency.referee.readers.formats.file_head import fields_of
 from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, are_dof
 from consistency.referee.readers.formats.spellings import OWN, TRUE, Clock, clock_of, naming, require_units
@@ -83,7 +83,7 @@ def require_columns(sheet: TableRows, axes: Sequence[str]) -> None:
         if axis in sheet:
             continue
         hint = ""
-        if tuple(axes) == tuple(POSE):
+        if is_pose(axes):
             hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
         what = f"column '{axis}' is missing; there are: {sheet.columns}"
         raise InputError(f"{sheet.path}: {what}; {naming(axis)}{hint}")

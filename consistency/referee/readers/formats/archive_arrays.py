@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.records.groups import on_steps
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof
+from consistency.referee.readers.formats.sheet import NIS_DOF, checked_dof
 from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
@@ -139,13 +139,13 @@ class Archive:
         nis = self.array("nis", 2)
         if nis.shape != shape:
             raise InputError(f"{self.path}: key 'nis' has shape {nis.shape}, needs {shape}")
-        dof = self.whole_numbers("nis_dof", shape)
-        known = np.isfinite(nis)
-        is_bad = (nis < 0) | np.isinf(nis)
-        if is_bad.any() or not are_dof(dof[known]).all():
-            needed = "nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
-            raise InputError(f"{self.path}: keys 'nis', 'nis_dof': {needed}")
-        return nis, np.where(known, dof, 0.0)
+        dof = np.where(np.isnan(nis), 0.0, self.whole_numbers("nis_dof", shape))
+        steps = shape[1]
+
+        def place(k: int) -> str:
+            return f"{self.path}, run {k // steps}, step {k % steps + 1}"
+
+        return nis, checked_dof(nis.ravel(), dof.ravel(), place).reshape(shape)
 
     def times(self, steps: int) -> Array:
         """Key ``t``, (steps,) in s; NaN without it."""

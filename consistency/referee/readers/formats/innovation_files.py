@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,13 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
 from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
-from consistency.referee.readers.formats.sheet import CsvTable, TableRows, are_dof, read_sheet
+from consistency.referee.readers.formats.sheet import DOF_NEEDED, CsvTable, TableRows, checked_dof, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order, with_clock
 from consistency.referee.readers.formats.text_blocks import bounded
-from consistency.referee.readers.places import listed, refuse
+from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
 NEEDED = ("nis", "nis_dof")
-DOF_NEEDED = "a whole number from 0 to below 2^31"
 
 
 @dataclass(frozen=True)
@@ -80,21 +79,6 @@ def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "
     if choice not in there:
         raise InputError(f"--{option} {choice}: is not in {path}; there are: {listed(there)}")
     return choice
-
-
-def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
-    """Degrees of freedom (N,), 0 where neither they nor a NIS is given.
-
-    Raises
-    ------
-    InputError
-        A NIS is negative or infinite, or its degrees of freedom are not a whole number of 0 or more.
-    """
-    dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
-    bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
-    needed = f"nis must be 0 or more and finite, nis_dof {DOF_NEEDED}"
-    refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
-    return dof
 
 
 def _require_columns(place: Path | str, columns: Sequence[str]) -> None:

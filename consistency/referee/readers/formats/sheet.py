@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ EMPTY = frozenset((  # what pandas and R write for no value
 ))  # fmt: skip
 OF_ONE_RUN = "write such poses to a file for each run and estimator"  # of a file with these columns
 NIS_DOF = "it is the number of measurements in each nis"  # of a column that is missing
+DOF_NEEDED = "a whole number from 0 to below 2^31"
 TRUTHS = {"True": True, "true": True, "TRUE": True, "False": False, "false": False, "FALSE": False}
 
 
@@ -121,6 +122,21 @@ class TableRows(FileRows):
 def are_dof(values: Array) -> Array:
     """Whether numbers are degrees of freedom: whole, from 0 to below 2^31."""
     return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
+
+
+def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
+    """Degrees of freedom (N,), 0 where neither they nor a NIS is given.
+
+    Raises
+    ------
+    InputError
+        A NIS is negative or infinite, or its degrees of freedom are not a whole number of 0 or more.
+    """
+    dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
+    bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
+    needed = f"nis must be 0 or more and finite, nis_dof {DOF_NEEDED}"
+    refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
+    return dof
 
 
 # --- tables ------------------------------------------------------------------------------------------

@@ -13,11 +13,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.clock_units import unit_of
 from consistency.referee.readers.formats.columns import Entries, covariance_columns, entry_name, is_pose, state_columns
 from consistency.referee.readers.formats.file_head import fields_of
-from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, are_dof
+from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, checked_dof
 from consistency.referee.readers.formats.spellings import OWN, TRUE, Clock, clock_of, naming, require_units
 from consistency.referee.readers.formats.text_blocks import FileRows, blocks
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.places import exact, refuse
+from consistency.referee.readers.places import exact
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
 
@@ -253,9 +253,5 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
     if "nis_dof" not in sheet:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; {NIS_DOF}")
     nis = sheet.numbers("nis")
-    dof = sheet.numbers("nis_dof")
-    known = np.isfinite(nis)
-    bad = (nis < 0) | np.isinf(nis) | (known & ~are_dof(dof))
-    what = "nis {:g} with nis_dof {:g}; nis must be 0 or more, nis_dof a whole number from 0 to below 2^31".format
-    refuse(bad, sheet.place, lambda row: what(nis[row], dof[row]))
-    return nis, np.where(known, dof, 0.0)
+    dof = np.where(np.isnan(nis), 0.0, sheet.numbers("nis_dof"))
+    return nis, checked_dof(nis, dof, sheet.place)

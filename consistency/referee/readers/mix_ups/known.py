@@ -26,6 +26,8 @@ UNIT = 1e-3  # lengths of quaternions differ by less from 1
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
 
+Function = Callable[[Any], Any]  # of a field of poses
+
 
 @dataclass(frozen=True)
 class Guess:
@@ -55,7 +57,7 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     if kind == "spatial":
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
         angles = slice(3, 6)
-        half = Guess(words, lambda p: _weighed(p, angles, 2.0), exact=True)
+        half = Guess(words, changed(covariance=_times(angles, 2.0)), exact=True)
         own = [*_orders(convention), *_quaternions(), *of_covariance]
         own += [*_units(3, angles), half, *_positions(3)]
     else:
@@ -65,13 +67,93 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
 
 
+# --- what makes fields of poses right ----------------------------------------------------------------
+
+
+def changed(**functions: Function) -> Change:
+    """A change of some fields of poses, each by a function of what it holds."""
+
+    def change(p: Poses) -> Poses:
+        return replace(p, **{name: function(getattr(p, name)) for name, function in functions.items()})
+
+    return change
+
+
+def _columns(order: Sequence[int]) -> Function:
+    """Columns (N, m) in another order."""
+    return lambda values: values[:, list(order)]
+
+
+def _components(order: Sequence[int]) -> Function:
+    """Rows and columns of matrices (N, n, n) in another order."""
+    return partial(submatrices, index=order)
+
+
+def _declared(convention: str) -> Function:
+    """Another convention of the error."""
+    return lambda _: convention
+
+
+def _times(part: slice, factor: float) -> Function:
+    """Matrices (N, n, n) with some components multiplied by a factor."""
+
+    def scaled(P: Array) -> Array:
+        scale = np.ones(P.shape[-1])
+        scale[part] = factor
+        return P * scale[:, None] * scale
+
+    return scaled
+
+
+def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
+    """The run with a function of those estimates that are finite."""
+    finite = finite_rows(p.estimate)
+    estimate = p.estimate.copy()
+    if finite.any():
+        estimate[finite] = function(estimate[finite])
+    return replace(p, estimate=estimate)
+
+
+def _inverse(p: Poses) -> Poses:
+    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
+
+
+# --- covariances -------------------------------------------------------------------------------------
+
+
 def _roots(part: list[int]) -> Iterator[Guess]:
     """Standard deviations, an inverse or a root in the place of the covariance."""
-    yield Guess("its diagonal holds standard deviations; square them", _covariance(_squared))
-    yield Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part)))
+    yield Guess("its diagonal holds standard deviations; square them", changed(covariance=_squared))
+    inverted = partial(_inverted, part=part)
+    yield Guess("it is an information matrix; invert it", changed(covariance=inverted))
     words = "it holds the upper root U of an information matrix U'U; write the inverse of U'U"
-    yield Guess(words, _covariance(lambda P: _inverted(_of_root(P), part)))
-    yield Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root))
+    yield Guess(words, changed(covariance=lambda U: inverted(_of_root(U))))
+    yield Guess("it holds the lower root L of the covariance; write L L'", changed(covariance=_of_root))
+
+
+def _squared(P: Array) -> Array:
+    return np.square(_without_cross_terms(P))
+
+
+def _without_cross_terms(P: Array) -> Array:
+    variances = np.diagonal(P, axis1=1, axis2=2)
+    return np.asarray(variances[:, :, None] * np.eye(P.shape[-1]))
+
+
+def _of_root(P: Array) -> Array:
+    """U'U of the upper triangles U, which are the lower ones L turned over."""
+    U = np.triu(P)
+    return np.asarray(np.swapaxes(U, 1, 2) @ U)
+
+
+def _inverted(P: Array, part: list[int]) -> Array:
+    """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
+    out = np.full_like(P, np.nan)
+    block = submatrices(P, part)
+    finite = np.flatnonzero(finite_rows(block))
+    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
+    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
+    return out
 
 
 def _blocks(n: int) -> Iterator[Guess]:
@@ -87,7 +169,7 @@ def _blocks(n: int) -> Iterator[Guess]:
             components = 3 * order[:, None] + np.arange(3)
             whole = components.ravel().tolist()
             words = f"the blocks of its covariance are in the order {text}; add --covariance-order {text}"
-            yield Guess(words, _reordered(None, whole))
+            yield Guess(words, changed(covariance=_components(whole)))
 
 
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
@@ -112,28 +194,10 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
         f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations); "
         "look for lost digits or a correlation of 1"
     )
-    yield Guess(words, _covariance(_without_cross_terms))
+    yield Guess(words, changed(covariance=_without_cross_terms))
 
 
-def _without_cross_terms(P: Array) -> Array:
-    return np.asarray(_diagonal(P) * np.eye(P.shape[-1]))
-
-
-def _diagonal(P: Array) -> Array:
-    return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
-
-
-def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
-    """The run with a function of those estimates that are finite."""
-    finite = finite_rows(p.estimate)
-    estimate = p.estimate.copy()
-    if finite.any():
-        estimate[finite] = function(estimate[finite])
-    return replace(p, estimate=estimate)
-
-
-def _inverse(p: Poses) -> Poses:
-    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
+# --- orders ------------------------------------------------------------------------------------------
 
 
 def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
@@ -189,7 +253,10 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
     for order, there in _other_orders(axes, width):
         words = what.format(f"in the order {there}{' (rotations alike)' * (n > width)}")
         whole = [*order, *(width + i for i in order)][:n]
-        yield Guess(f"{words}; write them as {', '.join(axes[:width])}", _reordered(whole if states else None, whole))
+        fields = {"covariance": _components(whole)}
+        if states:
+            fields["estimate"] = _columns(whole)
+        yield Guess(f"{words}; write them as {', '.join(axes[:width])}", changed(**fields))
 
 
 def _positions(width: int) -> Iterator[Guess]:
@@ -201,8 +268,10 @@ def _positions(width: int) -> Iterator[Guess]:
         rest = [3, 4, 5]
     for order, there in _other_orders(axes, width):
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
-        yield Guess(f"the positions {words}", _reordered([*order, *turned]), fine=False)
-        yield Guess(f"positions and covariance {words}", _reordered([*order, *turned], [*order, *rest]), fine=False)
+        estimate = _columns([*order, *turned])
+        covariance = _components([*order, *rest])
+        yield Guess(f"the positions {words}", changed(estimate=estimate), fine=False)
+        yield Guess(f"positions and covariance {words}", changed(estimate=estimate, covariance=covariance), fine=False)
 
 
 def _other_orders(axes: Sequence[str], width: int) -> Iterator[tuple[list[int], str]]:
@@ -225,71 +294,56 @@ def _swapped(order: Sequence[int], i: int, j: int) -> list[int]:
     return swapped
 
 
-def _reordered(
-    estimate: list[int] | None = None, covariance: list[int] | None = None, convention: str | None = None
-) -> Change:
-    """Columns of the estimates, components of their covariance, and its error, in place of others where given."""
-
-    def change(p: Poses) -> Poses:
-        if estimate is not None:
-            p = replace(p, estimate=p.estimate[:, estimate])
-        if covariance is not None:
-            p = replace(p, covariance=submatrices(p.covariance, covariance))
-        return replace(p, convention=convention or p.convention)
-
-    return change
-
-
 def _orders(convention: str) -> Iterator[Guess]:
-    swapped = [3, 4, 5, 0, 1, 2]
+    """Blocks of the covariance in the other order, other conventions of the error, and both."""
+    swapped = _components([3, 4, 5, 0, 1, 2])
     turned = "the covariance has its two blocks in the other order (--covariance-order)"
-    yield Guess(turned, _reordered(None, swapped))
+    yield Guess(turned, changed(covariance=swapped))
     for other in SPATIAL:
         if other != convention:
             guess = _of_error(other)
             yield guess
-            yield Guess(f"{guess.text} and {turned}", _reordered(None, swapped, other))
+            yield Guess(f"{guess.text} and {turned}", changed(covariance=swapped, convention=_declared(other)))
 
 
 def _of_error(convention: str) -> Guess:
-    return Guess(f"the error is '{convention}' (--error {convention})", _reordered(convention=convention))
+    return Guess(f"the error is '{convention}' (--error {convention})", changed(convention=_declared(convention)))
 
 
 def _quaternions() -> Iterator[Guess]:
-    first = [0, 1, 2, 4, 5, 6, 3]
+    first = _columns([0, 1, 2, 4, 5, 6, 3])
     for of, names in OF.items():
         words = f"the quaternions of {of} are w x y z; write them x y z w"
-        yield Guess(words, _changed(names, lambda values: values[:, first]))
+        yield Guess(words, changed(**dict.fromkeys(names, first)))
     back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
     words = "the quaternions of the estimates turn world into body; invert them"
-    yield Guess(words, _changed(["estimate"], lambda values: values * back))
+    yield Guess(words, changed(estimate=lambda values: values * back))
 
 
-def _changed(names: Sequence[str], function: Callable[[Array], Any]) -> Change:
-    return lambda p: replace(p, **{name: function(getattr(p, name)) for name in names})
+# --- units -------------------------------------------------------------------------------------------
 
 
 def _headings() -> Iterator[Guess]:
-    degrees = np.array([1.0, 1.0, DEGREE])
-    remedy = "; multiply them by pi / 180"
+    """Headings in degrees, of one file or of both, with their variances or without."""
     for of, names in OF.items():
-        volume = float(np.log(DEGREE)) if "truth" in names else 0.0
-        for what in ("", " and their variances"):
-            words = f"the headings of {of}{what} are in degrees{remedy}"
-            change = partial(_scaled, names, degrees, variances=bool(what))
-            yield Guess(words, change, fine="truth" not in names, volume=volume)
+        fields = dict.fromkeys(("estimate", "truth"), _wrapped)
+        fields |= dict.fromkeys(names, _radians)
+        fine = "truth" not in names
+        volume = 0.0 if fine else float(np.log(DEGREE))
+        words = f"the headings of {of}{{}} are in degrees; multiply them by pi / 180".format
+        yield Guess(words(""), changed(**fields), fine=fine, volume=volume)
+        fields["covariance"] = _times(slice(2, 3), DEGREE)
+        yield Guess(words(" and their variances"), changed(**fields), fine=fine, volume=volume)
 
 
-def _scaled(names: Sequence[str], factors: Array, p: Poses, variances: bool = False) -> Poses:
-    """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
-    if variances:
-        p = _weighed(p, slice(0, 3), factors)
-    p = replace(p, estimate=p.estimate.copy(), truth=p.truth.copy())
-    for name in names:
-        getattr(p, name)[:] *= factors
-    for values in (p.estimate, p.truth):
-        values[:, 2] = wrap(values[:, 2])
-    return p
+def _radians(values: Array) -> Array:
+    """Poses in the plane whose headings are in degrees, with headings in rad."""
+    return _wrapped(values * [1.0, 1.0, DEGREE])
+
+
+def _wrapped(values: Array) -> Array:
+    """Poses in the plane with headings within half a turn."""
+    return np.column_stack([values[:, :2], wrap(values[:, 2])])
 
 
 def _units(width: int, angles: slice) -> Iterator[Guess]:
@@ -301,47 +355,15 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         out[:, part] *= MILLI
         return out
 
+    less = _times(part, MILLI)
     words = "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180"
-    yield Guess(words, lambda p: _weighed(p, angles, DEGREE))
+    yield Guess(words, changed(covariance=_times(angles, DEGREE)))
     words = "its positions are in millimetres (mm^2 for m^2); divide them by 1000"
-    yield Guess(words, lambda p: _weighed(p, part, MILLI))
+    yield Guess(words, changed(covariance=less))
     remedy = "in millimetres; divide them by 1000"
     words = f"the positions of the estimates and their covariance are {remedy}"
-
-    def both(p: Poses) -> Poses:
-        return _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI)
-
-    yield Guess(words, both)
-    yield Guess(f"the positions of the estimates are {remedy}", _changed(["estimate"], shrunk))
+    yield Guess(words, changed(estimate=shrunk, covariance=less))
+    yield Guess(f"the positions of the estimates are {remedy}", changed(estimate=shrunk))
+    words = f"the positions of the truth are {remedy}"
     volume = width * float(np.log(MILLI))
-    yield Guess(f"the positions of the truth are {remedy}", _changed(["truth"], shrunk), fine=False, volume=volume)
-
-
-def _covariance(function: Callable[[Array], Array]) -> Change:
-    return lambda p: replace(p, covariance=function(p.covariance))
-
-
-def _weighed(p: Poses, part: slice, factor: float | Array) -> Poses:
-    scale = np.ones(p.covariance.shape[-1])
-    scale[part] = factor
-    return replace(p, covariance=p.covariance * scale[:, None] * scale)
-
-
-def _squared(P: Array) -> Array:
-    return np.square(_diagonal(P)) * np.eye(P.shape[-1])
-
-
-def _of_root(P: Array) -> Array:
-    """U'U of the upper triangles U, which are the lower ones L turned over."""
-    U = np.triu(P)
-    return np.asarray(np.swapaxes(U, 1, 2) @ U)
-
-
-def _inverted(P: Array, part: list[int]) -> Array:
-    """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out = np.full_like(P, np.nan)
-    block = submatrices(P, part)
-    finite = np.flatnonzero(finite_rows(block))
-    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
-    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
-    return out
+    yield Guess(words, changed(truth=shrunk), fine=False, volume=volume)

@@ -159,9 +159,14 @@ def record_in_groups(record: Record, r: Reading) -> Record:
         cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
     if cells is None:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
-    column = column_of(r.by, cells)
-    column = replace(column, outcome=selects_on_outcome(column, record.axes))
-    return grouped(replace(record, by=column.values), column, r)
+    return _by_cells(record, r.by, cells, r)
+
+
+def _by_cells(record: Record, name: str, cells: Array, r: Reading, option: str = "--by") -> Record:
+    """The record with groups of the cells of a column, (runs, steps)."""
+    column = column_of(name, cells)
+    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
+    return grouped(replace(record, by=column.values), column, r, option)
 
 
 def with_groups(
@@ -184,11 +189,10 @@ def with_groups(
         raise InputError(f"by: {record.name} {NO_TRUTH}")
     ((name, values),) = by.items()
     try:
-        column = column_of(name, on_steps(values, record.nees.shape))
+        cells = on_steps(values, record.nees.shape)
     except ValueError as wrong:
         raise InputError(f"by: {wrong}") from None
-    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
-    return grouped(replace(record, by=column.values), column, Reading(bins=bins), "by")
+    return _by_cells(record, name, cells, Reading(bins=bins), "by")
 
 
 # --- a table of its own -------------------------------------------------------------------------------

@@ -16,9 +16,13 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
-from consistency.referee.readers.truth_matching import at, finite_rows, submatrices
+from consistency.referee.readers.truth_matching import Estimator, at, finite_rows, submatrices
 from consistency.referee.types import Array, Failure, Indices
 
+STILL = (
+    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
+    "robot in the plane"
+)
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
 ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
 
@@ -284,6 +288,22 @@ def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indice
     idle: Indices = still & constant & (len(variance) > 1)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
     return np.zeros(len(idle), bool) if still.all() or none.any() else idle
+
+
+def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
+    """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
+    part = np.array(judged)
+    variances = []
+    of_part = []
+    for p, error in zip(e.runs, errors, strict=True):
+        variances.append(np.diagonal(p.covariance, axis1=1, axis2=2)[p.stated][:, part])
+        of_part.append(error[:, part])
+    idle = not_estimated(of_part, variances)
+    if not idle.any():
+        return list(judged), []
+    names = ", ".join(np.array(e.axes)[part[idle]])
+    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
+    return part[~idle].tolist(), [note]
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

@@ -11,6 +11,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.columns import pose_columns, rates_in, state_columns
 from consistency.referee.readers.formats.file_head import beginning, begins_with_numbers, head_of
 from consistency.referee.readers.formats.spellings import PLAIN, Columns, clock_of
+from consistency.referee.readers.options import Reading
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
@@ -77,6 +78,53 @@ def table_files(folder: Path) -> list[Path]:
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+
+
+def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
+    truth = r.truth
+    if not estimates.is_dir():
+        for option, path in (("--truth", truth), ("--covariance", covariance)):
+            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
+                raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
+        return [(estimates, truth or estimates, covariance)]
+    files = trajectory_files(estimates, r.columns)
+    if not files:
+        raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
+    stems = [path.stem for path in files]
+    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
+    if covariance is not None and not covariance.is_dir():
+        raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
+    out = []
+    for path in files:
+        own_truth = path
+        own_covariance = None
+        if truth is not None:
+            own_truth = paired(truth, path, "--truth")
+        if covariance is not None:
+            own_covariance = paired(covariance, path, "--covariance")
+        out.append((path, own_truth, own_covariance))
+    return out
+
+
+def paired(other: Path, path: Path, option: str, kind: str = "file '{}' with .txt or .tum, or table,") -> Path:
+    """What goes with a file of a run: the file of the same name in another folder; a file or a drive goes with all.
+
+    Raises
+    ------
+    InputError
+        The folder holds no such file.
+    """
+    if is_drive(other) or not other.is_dir():
+        return other
+    if is_drive(other / path.stem):
+        return other / path.stem
+    for file in (*trajectory_files(other), *table_files(other)):
+        if file.stem == path.stem:
+            return file
+    what = f"holds no {kind.format(path.stem)} for {path}"
+    raise InputError(f"{option} {other}: {what}; files of the two folders are paired by name")
 
 
 def fitted_note(path: Path) -> str:

@@ -17,6 +17,7 @@ from consistency.referee.readers.formats.columns import covariance_columns, pose
 from consistency.referee.readers.formats.file_head import fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
+    files_of_runs,
     is_bag,
     is_plane,
     is_solution,
@@ -28,7 +29,6 @@ from consistency.referee.readers.formats.pose_covariances import ORDERS, compone
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, TRIANGLE
 from consistency.referee.readers.formats.pose_rows import POSE as POSE_NUMBERS
 from consistency.referee.readers.formats.text_blocks import opened
-from consistency.referee.readers.formats.tum import files_of_runs
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE
 

@@ -13,7 +13,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.formats import pose_covariances as stated_as
-from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
+from consistency.referee.readers.formats.file_kinds import files_of_runs, is_drive, paired
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.pose_covariances import ORDERS
@@ -336,9 +336,7 @@ def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
     if r.truth_covariance is None:
         return None
     if r.truth_covariance != COLUMNS:
-        path = Path(r.truth_covariance)
-        if path.is_dir():
-            path = _same_stem(path, own.path, "--truth-covariance")
+        path = paired(Path(r.truth_covariance), own.path, "--truth-covariance")
         return stated_as.from_file(truth, path, order, r.tolerance)
     P = truth.covariances if isinstance(truth, Fixes) else stated_as.covariances_in(truth, order)
     if P is None:
@@ -362,44 +360,6 @@ def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
         return _checked(beside)
 
     return read
-
-
-def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
-    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
-    truth = r.truth
-    if not estimates.is_dir():
-        for option, path in (("--truth", truth), ("--covariance", covariance)):
-            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
-                raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
-        return [(estimates, truth or estimates, covariance)]
-    files = trajectory_files(estimates, r.columns)
-    if not files:
-        raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
-    stems = [path.stem for path in files]
-    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
-        raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
-    if covariance is not None and not covariance.is_dir():
-        raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
-    out = []
-    for path in files:
-        own_truth = truth or path
-        own_covariance = covariance
-        if truth is not None and truth.is_dir() and not is_drive(truth):
-            own_truth = _same_stem(truth, path, "--truth")
-        if covariance is not None:
-            own_covariance = _same_stem(covariance, path, "--covariance")
-        out.append((path, own_truth, own_covariance))
-    return out
-
-
-def _same_stem(folder: Path, path: Path, option: str) -> Path:
-    if is_drive(folder / path.stem):
-        return folder / path.stem
-    for other in (*trajectory_files(folder), *table_files(folder)):
-        if other.stem == path.stem:
-            return other
-    what = f"holds no file '{path.stem}' with .txt or .tum, or table, for {path}"
-    raise InputError(f"{option} {folder}: {what}; files of the two folders are paired by name")
 
 
 def read_trajectory(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:

@@ -144,10 +144,8 @@ class ProgramStudy:
         """How many runs are there, where some are missing."""
         if self.manifest["complete"]:
             return ""
-        there = str(len(runs_in(self.folder)))
-        if self.manifest["runs"]:
-            there += f" of {self.manifest['runs']}"
-        return f"only {there} runs are there"
+        of = f" of {self.manifest['runs']}" if self.manifest["runs"] else ""
+        return f"only {len(runs_in(self.folder))}{of} runs are there"
 
     def files_of(self, run: ProgramRun, r: Reading) -> tuple[Path, Reading]:
         """The estimates of a run, and the options by which they are read, with its own truth.
@@ -333,9 +331,7 @@ def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
     for record in records:
         for failure in record.failures:
             kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
-    if not kinds:
-        return []
-    runs = runs_in(folder)
+    runs = runs_in(folder) if kinds else {}
     sentences = []
     for of_runs in kinds.values():
         first, why = min(of_runs.items())
@@ -364,9 +360,8 @@ def _nothing(path: Path, option: str, run: ProgramRun) -> str:
     if option != "--estimates" and here.exists():
         return f"the program wrote no {relative}; for the one where you stand write {option} {{here}}/{relative}"
     others = sorted({each.name for each in run.folder.iterdir()} - {LOG, RUN_FILE})
-    if not others:
-        return f"the program wrote no {relative} ({option}), and nothing else"
-    return f"the program wrote no {relative} ({option}); it wrote {', '.join(others[:5])}"
+    wrote = f"; it wrote {', '.join(others[:5])}" if others else ", and nothing else"
+    return f"the program wrote no {relative} ({option}){wrote}"
 
 
 def _without_folder(one: Estimator, folder: Path) -> Estimator:

@@ -18,7 +18,7 @@ from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
-from consistency.referee.readers.runs_to_record import Track, assemble, in_columns, not_estimated
+from consistency.referee.readers.runs_to_record import Track, assemble, estimated_components, in_columns
 from consistency.referee.readers.truth_matching import (
     AXES,
     ROUNDING,
@@ -37,10 +37,6 @@ if TYPE_CHECKING:
 OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
-STILL = (
-    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
-    "robot in the plane"
-)
 
 
 def records_of(e: Estimator, r: Reading) -> list[Record]:
@@ -58,22 +54,22 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
-    column = None
-    if r.by is not None:
-        from consistency.referee.readers.pipeline.by_column import with_values
-
-        e, column = with_values(e, r, judged)
-    relative = windows_asked(r)
-    pairs = list[Poses]()
-    if relative is not None:
-        records = [_record_of_windows(e, judged, r, relative)]
-    else:
-        records, pairs = _records_of_poses(e, judged, r)
-    if column is None:
+    if r.by is None:
+        records, _ = _records(e, judged, r)
         return records
-    from consistency.referee.readers.pipeline.by_column import in_groups
+    from consistency.referee.readers.pipeline.by_column import in_groups, with_values
 
+    e, column = with_values(e, r, judged)
+    records, pairs = _records(e, judged, r)
     return in_groups(records, column, e, pairs, r)
+
+
+def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
+    """Records of motions over windows or of poses, and the estimates beside their truth of the latter."""
+    relative = windows_asked(r)
+    if relative is not None:
+        return [_record_of_windows(e, judged, r, relative)], []
+    return _records_of_poses(e, judged, r)
 
 
 def windows_asked(r: Reading) -> Relative | None:
@@ -131,7 +127,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     if e.in_space:
         notes += _space_notes(e, pairs, errors)
         if r.axes is None:
-            judged, still = _estimated(e, errors, judged)
+            judged, still = estimated_components(e, errors, judged)
             notes += still
     causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
@@ -224,12 +220,10 @@ def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> li
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
     notes = []
     what = "no truth"
-    total = 0
-    left_out = 0
+    total = sum(len(p.t) for p in runs)
+    left_out = total - sum(len(p.t) for p in pairs)
     furthest = 0.0
     for p, found in zip(runs, pairs, strict=True):
-        total += len(p.t)
-        left_out += len(p.t) - len(found.t)
         if not p.stated.all():
             what = "no truth or no covariance"
         if found.apart is not None:
@@ -283,22 +277,6 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
         if len(finite):
             largest = max(largest, float(np.median(finite)))
     return largest
-
-
-def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
-    """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
-    part = np.array(judged)
-    variances = []
-    of_part = []
-    for p, error in zip(e.runs, errors, strict=True):
-        variances.append(_variances(p)[p.stated][:, part])
-        of_part.append(error[:, part])
-    idle = not_estimated(of_part, variances)
-    if not idle.any():
-        return list(judged), []
-    names = ", ".join(np.array(e.axes)[part[idle]])
-    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
-    return part[~idle].tolist(), [note]
 
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
@@ -387,17 +365,8 @@ def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        error = np.where(finite_rows(p.estimate), 0.0, np.nan)
-        track = Track(
-            p.run,
-            np.arange(len(p.t)),
-            p.place,
-            error[:, None],
-            nis=p.nis,
-            nis_dof=p.nis_dof,
-            t=p.clock,
-        )
-        tracks.append(track)
+        error = np.where(finite_rows(p.estimate), 0.0, np.nan)[:, None]
+        tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
     record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)

@@ -13,7 +13,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
-from consistency.referee.readers.formats.file_kinds import table_files
+from consistency.referee.readers.formats.file_kinds import paired, table_files
 from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
@@ -30,19 +30,11 @@ def read_table_folder(folder: Path, r: Reading, poses_alone: bool = False) -> li
     """
     found = {}
     for run, file in enumerate(table_files(folder)):
-        truth = r.truth
-        if truth is not None and truth.is_dir():
-            truth = _same_stem(truth, file)
-        found[run] = read_tables(file, replace(r, truth=truth), poses_alone)
+        of_run = r
+        if r.truth is not None:
+            of_run = replace(r, truth=paired(r.truth, file, "--truth", "table '{}'"))
+        found[run] = read_tables(file, of_run, poses_alone)
     return merged(found, folder.stem)
-
-
-def _same_stem(folder: Path, file: Path) -> Path:
-    """The table of a folder for the run of another one."""
-    for other in table_files(folder):
-        if other.stem == file.stem:
-            return other
-    raise InputError(f"--truth {folder}: holds no table '{file.stem}' for {file}")
 
 
 def merged(

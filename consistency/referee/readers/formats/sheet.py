@@ -190,7 +190,9 @@ def frame_rows(frame: Any, name: str) -> TableRows:
     require_distinct(list(map(str, frame.columns)), name)
     data = {}
     for column in frame.columns:
-        data[str(column)] = _cells(np.asarray(frame[column]))
+        values = np.asarray(frame[column])
+        is_number = values.dtype.kind in "fiu"
+        data[str(column)] = np.asarray(values, float) if is_number else _cells(values.tolist())
     rows = len(next(iter(data.values()), ()))
     if not rows:
         raise InputError(f"{name}: holds no row")
@@ -204,12 +206,12 @@ def require_distinct(names: Sequence[str], where: Path | str) -> None:
         raise InputError(f"{where}: column '{twice[0]}' is duplicated")
 
 
-def _cells(values: Array) -> Column:
-    """A column in memory: floats, or objects with None where a cell is empty."""
-    if values.dtype.kind in "fiu":
-        return np.asarray(values, float)
-    filled = [None if str(cell) in EMPTY else cell for cell in values.tolist()]
-    return np.array(filled, object)
+def _cells(values: Sequence[Any]) -> Column:
+    """Cells as floats where all are numbers or empty, or as objects with None where one is empty."""
+    filled = [None if str(cell) in EMPTY else cell for cell in values]
+    if set(map(type, filled)) <= {int, float, type(None)}:
+        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in filled], float)
+    return np.array([*filled, None], object)[:-1]
 
 
 def _read_csv(path: Path) -> TableRows:
@@ -347,7 +349,7 @@ def _read_json_lines(path: Path) -> TableRows:
     rows = list(itertools.chain.from_iterable(found.parts))
     columns = {}
     for name in dict.fromkeys(itertools.chain.from_iterable(rows)):
-        columns[name] = _key_column([row.get(name) for row in rows])
+        columns[name] = _cells([row.get(name) for row in rows])
     return TableRows(path, columns, found.line, "line", found.open_line, found.cut)
 
 
@@ -371,10 +373,3 @@ def _keys(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         return
     for key, each in value.items():
         yield from _keys(f"{name}.{key}".lstrip("."), each)
-
-
-def _key_column(cells: list[Any]) -> Array:
-    """Floats where all cells are numbers or missing, else objects."""
-    if set(map(type, cells)) <= {int, float, type(None)}:
-        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in cells], float)
-    return np.array([*cells, None], object)[:-1]

@@ -208,9 +208,9 @@ def require_distinct(names: Sequence[str], where: Path | str) -> None:
 
 def _cells(values: Sequence[Any]) -> Column:
     """Cells as floats where all are numbers or empty, or as objects with None where one is empty."""
+    if set(map(type, values)) <= {int, float, type(None)}:
+        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in values], float)
     filled = [None if str(cell) in EMPTY else cell for cell in values]
-    if set(map(type, filled)) <= {int, float, type(None)}:
-        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in filled], float)
     return np.array([*filled, None], object)[:-1]
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows, submatrices
+from consistency.referee.geometry.groups import adjoint, inverse, matrices, propagated, to_left, vectors
+from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows
 from consistency.referee.types import Array
 
 
@@ -70,19 +71,12 @@ def carried(convention: str, frame: WorldTransform, n: int) -> Array:
 
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
-    if convention == "left":
-        return np.eye(n)
-    turn = frame.turn.as_matrix()
-    T = np.eye(6)
-    T[:3, :3] = turn
-    if convention in ("so3", "right"):
-        T[3:, 3:] = turn
-    if convention == "right":
-        T[:3, 3:] = skew(frame.shift) @ turn
+    F = matrices(np.array([[*frame.shift, *frame.turn.as_quat()]]))
+    T = to_left(inverse(F), convention)[0]
     if n == 6:
         return T
     part = PLANE[:n]
-    return T[np.ix_(part, part)]
+    return np.asarray(T[np.ix_(part, part)])
 
 
 def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
@@ -174,47 +168,25 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
 
 
 def on_body(p: Poses, body: BodyTransform) -> Poses:
-    """The estimates as poses of the other body, with their covariance to first order."""
+    """The estimates as poses of the other body, with their covariance to first order.
+
+    The left error of T B is Ad(B)^-1 e of the left error e of T (Sola et al. 2018, eq. 175).
+    """
     finite = finite_rows(p.estimate)
-    estimate = p.estimate.copy()
-    covariance = p.covariance.copy()
     if not finite.any():
         return p
-    own = p.estimate[finite]
-    R = rotations(own, p.manifold)
-    shift = R.apply(body.arm)
-    J = _jacobian(p.convention, R.as_matrix(), body)
+    pose = [*body.arm, *body.turn.as_quat()]
     if p.manifold == "planar":
-        position = own[:, :2] + shift[:, :2]
-        turned = wrap(own[:, 2] + body.turn.as_rotvec()[2])
-        J = submatrices(J, PLANE)
-    else:
-        position = own[:, :3] + shift
-        turned = (R * body.turn).as_quat()
-    estimate[finite] = np.column_stack([position, turned])
-    covariance[finite] = J @ p.covariance[finite] @ np.swapaxes(J, 1, 2)
+        pose = [*body.arm[:2], body.turn.as_rotvec()[2]]
+    B = matrices(np.array([pose]))
+    T = matrices(p.estimate[finite])
+    other = T @ B
+    J = to_left(inverse(other), p.convention) @ adjoint(inverse(B)) @ to_left(T, p.convention)
+    estimate = p.estimate.copy()
+    covariance = p.covariance.copy()
+    estimate[finite] = vectors(other)
+    covariance[finite] = propagated(J, p.covariance[finite])
     return replace(p, estimate=estimate, covariance=covariance)
-
-
-def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
-    """Error of the other pose by that of the own, (k, 6, 6), in each convention.
-
-    That of ``right`` is unchanged, and that of ``left`` maps by the adjoint (Sola et al. 2018, eq. 175); the others are
-    derivatives of p + R l at 0.
-    """
-    J = np.broadcast_to(np.eye(6), (len(R), 6, 6)).copy()
-    back = body.turn.inv().as_matrix()
-    arm = np.broadcast_to(body.arm, (len(R), 3))
-    if convention == "left":
-        J[:, :3, :3] = back
-        J[:, :3, 3:] = -back @ skew(arm)
-        J[:, 3:, 3:] = back
-    elif convention == "so3-body":
-        J[:, :3, 3:] = -R @ skew(arm)
-        J[:, 3:, 3:] = back
-    elif convention != "right":
-        J[:, :3, 3:] = -skew((R @ arm[..., None])[..., 0])
-    return np.asarray(J)
 
 
 def skew(v: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.groups import matrices, propagated, to_left
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines
@@ -74,15 +74,14 @@ def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Pose
         option = "--lever-arm" if arm.any() else "--error right"
         what = "moves errors of the rotation into that of the position, whose cross terms are not stated"
         raise InputError(f"{poses.place[0]}: {option} {what}; give covariances of whole poses")
-    R = np.full((len(poses.t), 3, 3), np.nan)
+    T = np.full((len(poses.t), 4, 4), np.nan)
     finite = finite_rows(poses.estimate)
-    if finite.any():
-        R[finite] = Rotation.from_quat(poses.estimate[finite, 3:]).as_matrix()
-    point = poses.estimate[:, :3] + R @ arm
+    T[finite] = matrices(poses.estimate[finite, :7])
+    point = poses.estimate[:, :3] + T[:, :3, :3] @ arm
     of_truth = poses.true_covariance
     if of_truth is not None:
         of_truth = of_truth[:, :3, :3]
-    J = _jacobian(poses.convention, R, arm, point)
+    J = _jacobian(poses.convention, T, arm)
     return replace(
         poses,
         estimate=point,
@@ -186,14 +185,8 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
     )
 
 
-def _jacobian(convention: str, R: Array, arm: Array, point: Array) -> Array:
-    """Error of the point by the error of the pose, (N, 3, 6): derivatives of each convention at 0."""
-    J = np.empty((len(R), 3, 6))
-    J[:, :, :3] = R if convention == "left" else np.eye(3)
-    if convention == "right":
-        J[:, :, 3:] = -skew(point)
-    elif convention == "so3":
-        J[:, :, 3:] = -skew(R @ arm)
-    else:
-        J[:, :, 3:] = -R @ skew(arm)
-    return J
+def _jacobian(convention: str, T: Array, arm: Array) -> Array:
+    """Error of the point by the error of the pose, (N, 3, 6): R (rho - arm x phi) by its left error (rho, phi)."""
+    R = T[:, :3, :3]
+    by_left = np.concatenate([R, -R @ skew(arm)], axis=-1)
+    return np.asarray(by_left @ to_left(T, convention))

@@ -239,7 +239,7 @@ def test_a_body_that_is_turned_over_takes_its_covariance_along(convention, rng):
     ).as_quat()
     S = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, -1.0]) if convention == "so3-body" else np.diag([1.0, -1.0, -1.0] * 2)
     there = replace(there, covariance=S @ there.covariance @ S)
-    *_, undo = _ned(convention)
+    *_, undo = _ned()
     assert_allclose(decades([undo.change(there)]), decades([p]), atol=1e-9)
 
 

@@ -173,8 +173,6 @@ def on_body(p: Poses, body: BodyTransform) -> Poses:
     The left error of T B is Ad(B)^-1 e of the left error e of T (Sola et al. 2018, eq. 175).
     """
     finite = finite_rows(p.estimate)
-    if not finite.any():
-        return p
     pose = [*body.arm, *body.turn.as_quat()]
     if p.manifold == "planar":
         pose = [*body.arm[:2], body.turn.as_rotvec()[2]]

@@ -64,7 +64,8 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
         sides = [kind for kind in PLANAR if kind not in (convention, "vector")]
         own = [*map(_of_error, sides), *_headings(), *of_covariance]
         own += [*_units(2, slice(2, 3)), *_positions(2)]
-    return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
+    words = "the poses of the estimates are inverse, world in body; invert them"
+    return [*own, Guess(words, changed(estimate=_inverse), fine=False)]
 
 
 # --- what makes fields of poses right ----------------------------------------------------------------
@@ -105,17 +106,12 @@ def _times(part: slice, factor: float) -> Function:
     return scaled
 
 
-def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
-    """The run with a function of those estimates that are finite."""
-    finite = finite_rows(p.estimate)
-    estimate = p.estimate.copy()
-    if finite.any():
-        estimate[finite] = function(estimate[finite])
-    return replace(p, estimate=estimate)
-
-
-def _inverse(p: Poses) -> Poses:
-    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
+def _inverse(poses: Array) -> Array:
+    """Inverse poses, where they are finite."""
+    finite = finite_rows(poses)
+    out = poses.copy()
+    out[finite] = vectors(inverse(matrices(poses[finite])))
+    return out
 
 
 # --- covariances -------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
+from consistency.referee.geometry.groups import inverse, vectors
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
 from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.rotations import are_rotations
@@ -131,10 +132,8 @@ def read_drive(folder: Path, body: str | None = None) -> Lines:
     if body not in (None, *BODIES):
         raise InputError(f"--body {body}: must be one of {', '.join(BODIES)}")
     stamps, poses = drive_poses(folder, body or "imu")
-    poses = np.linalg.inv(poses[0]) @ poses
-    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     t = (stamps - stamps[0]) * NANO
-    values = np.column_stack([t, poses[:, :3, 3], quaternion])
+    values = np.column_stack([t, vectors(inverse(poses[:1]) @ poses)])
     return Lines(folder, values, np.arange(1, len(t) + 1))
 
 

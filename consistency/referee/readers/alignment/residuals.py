@@ -100,10 +100,8 @@ def clocks_and_frames(
         shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
         if abs(shift - before) <= SETTLED:
             break
-    if shift == before:
-        found = aligned(name, later, align, judged, frames)
-    else:
-        found = aligned(name, [p.later(shift) for p in runs], align, judged)
+    later = [p.later(shift) for p in runs]
+    found = aligned(name, later, align, judged, frames if shift == before else None)
     as_before = []
     for p, own in zip(found.runs, runs, strict=True):
         as_before.append(replace(p, t=own.t))

@@ -120,7 +120,7 @@ def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
 
 
 def _winding(lengths: Array) -> float:
-    """1 less the mean length of mean directions; 0 where nothing moves."""
+    """1 - the mean length of mean directions; 0 where nothing moves."""
     known = lengths[np.isfinite(lengths)]
     return 1.0 - float(known.mean()) if len(known) else 0.0
 

@@ -72,11 +72,10 @@ def carried(convention: str, frame: WorldTransform, n: int) -> Array:
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
     F = matrices(np.array([[*frame.shift, *frame.turn.as_quat()]]))
-    T = to_left(inverse(F), convention)[0]
+    T: Array = to_left(inverse(F), convention)[0]
     if n == 6:
         return T
-    part = PLANE[:n]
-    return np.asarray(T[np.ix_(part, part)])
+    return T[np.ix_(PLANE[:n], PLANE[:n])]
 
 
 def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:

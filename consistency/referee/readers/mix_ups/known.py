@@ -128,7 +128,7 @@ def _roots(part: list[int]) -> Iterator[Guess]:
 
 
 def _squared(P: Array) -> Array:
-    return np.square(_without_cross_terms(P))
+    return np.asarray(np.square(_without_cross_terms(P)))
 
 
 def _without_cross_terms(P: Array) -> Array:

@@ -33,9 +33,9 @@ def is_pose(axes: Sequence[str]) -> bool:
 def state_columns(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:
     """Places of the components of a state that are there, under their own names or spelled like ``est_{}``."""
     once = places_of(names)
-    words_of = [(plain_name(axis),) for axis in axes]
+    words_of: Sequence[tuple[str, ...]] = [(plain_name(axis),) for axis in axes]
     if is_pose(axes):
-        words_of = list(known.PLANE)
+        words_of = known.PLANE
     found = {}
     for axis, words in zip(axes, words_of, strict=True):
         if "{}" in spellings and axis in names:

@@ -184,7 +184,7 @@ def _of_columns(path: Path, columns: Sequence[int], run: int, r: Reading, square
     names = [STATE[order.index(place)] for place in range(n)]
     pairs = list(itertools.combinations_with_replacement(names, 2))
     if many == n * n:
-        pairs = list(itertools.product(names, repeat=2))
+        pairs = list(itertools.product(names, names))
     elif many == n:
         pairs = list(zip(names, names, strict=True))
     return TextFile(path, dict(zip(columns, pairs, strict=True)), squared, run)

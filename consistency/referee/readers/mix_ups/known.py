@@ -322,7 +322,7 @@ def _quaternions() -> Iterator[Guess]:
 def _headings() -> Iterator[Guess]:
     """Headings in degrees, of one file or of both, with their variances or without."""
     for of, names in OF.items():
-        fields = dict.fromkeys(("estimate", "truth"), _wrapped)
+        fields: dict[str, Function] = dict.fromkeys(("estimate", "truth"), _wrapped)
         fields |= dict.fromkeys(names, _radians)
         fine = "truth" not in names
         volume = 0.0 if fine else float(np.log(DEGREE))

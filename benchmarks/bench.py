@@ -29,7 +29,7 @@ from scipy.linalg import blas, lapack
 from script_options import options_of
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.types import Estimates
 from consistency.referee.errors import InputError
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from bench_trials import SEED, Work, interleaved
 
-from consistency.bench.runs.findings import sibling
+from consistency.bench.runs.experiment_scripts import sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.shipped import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.registration import rigid_motions
-from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence
 from consistency.vision import register_svd, registration_covariance, triangulate, triangulation_covariance
 
 rigs = sibling(str(data_folder("experiments") / "README.md"), "published_rig")
@@ -71,6 +71,6 @@ def motions_per_second(repeats: int) -> tuple[float, str]:
     return (len(first) - 1) / seconds, f"{len(first) - 1} motions of {whole.folder.name}, {width} x {height}"
 
 
-def _odometry(sequence: Sequence) -> None:
+def _odometry(sequence: StereoSequence) -> None:
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
         visual_odometry(sequence, rng=np.random.default_rng(SEED))

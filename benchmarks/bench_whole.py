@@ -102,10 +102,11 @@ def child(runs: int, steps: int) -> dict[str, float]:
     """Peak memory in MiB and bytes a row of estimates on disk, of this process after ``runs`` runs and verdicts."""
     world = cs.load_scenario(WORLD).variant("bench", truth__steps=steps)
     with tempfile.TemporaryDirectory() as scratch:
-        results = cs.run_trials(world, FILTERS, runs, out=Path(scratch) / "out")
+        out = Path(scratch) / "out"
+        results = cs.run_trials(world, FILTERS, runs, out=out)
         cs.analyse(results)
         rows = sum(len(batch["step"]) for batch in results.batches("estimates", ["step"]))
-        size = (results.folder / "estimates.parquet").stat().st_size
+        size = (out / "estimates.parquet").stat().st_size
     return {"runs": runs, "peak_mib": peak_mib(), "rows": rows, "bytes": size}
 
 

@@ -16,7 +16,7 @@ from consistency.diagnostics import Record, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.groups import spatial_error
+from consistency.referee.geometry.lie_groups import spatial_error
 from consistency.referee.types import Array
 
 STEPS, DOF, RHO = 20_000, 3, 0.95

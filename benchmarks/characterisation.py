@@ -26,8 +26,8 @@ from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.log_residuals import residuals_of
 from consistency.stereo.characterising.sensor_text import believed_sensor
+from consistency.stereo.characterising.truth_residuals import residuals_of
 
 SCENARIO = "herath2007-stereo"
 EVERYTHING = (1e-6, 1e6)  # px: a search range that leaves nothing out

@@ -24,13 +24,20 @@ from scipy import stats
 from script_options import options_of
 
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, with_factors
-from consistency.referee.fit_covariance.factors import Factors, Fit, blocks_of, fit_alone
-from consistency.referee.fit_covariance.floors import SAME, fit_runs, fit_with_floors
+from consistency.referee.fit_covariance.factors import (
+    SAME,
+    Factors,
+    Fit,
+    blocks_of,
+    fit_alone,
+    fit_runs,
+    fit_with_floors,
+)
 from consistency.referee.types import Array
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")

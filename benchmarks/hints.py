@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.geometry import wrap
-from consistency.referee.geometry.groups import matrices, vectors
+from consistency.referee.geometry.lie_groups import matrices, vectors
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, skew
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.places import Places

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.diagnostics import Verdict, judge
-from consistency.referee.geometry.groups import composed, vectors
+from consistency.referee.geometry.lie_groups import composed, vectors
 from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import read_recordings

@@ -23,13 +23,13 @@ from script_options import options_of
 from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
+from consistency.referee.geometry.lie_groups import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Manifold, Poses
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 DT, SPEED = 0.1, 1.5  # s, m/s
 TURN = 0.03  # rad a step, and its spread

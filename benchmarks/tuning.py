@@ -23,10 +23,10 @@ from scipy import stats
 from script_options import options_of
 
 import consistency as cs
-from consistency.bench.tuning.fit import FactorFit
-from consistency.bench.tuning.noise_groups import groups_of, scaled
-from consistency.bench.tuning.scores import BeliefScorer
-from consistency.bench.tuning.split import parts_of
+from consistency.bench.tuning.fit_and_verdict_trials import parts_of
+from consistency.bench.tuning.innovation_likelihood import BeliefScorer
+from consistency.bench.tuning.noise_factor_fit import FactorFit
+from consistency.bench.tuning.noise_groups import noise_groups_of, scaled
 from consistency.bench.tuning.tune import fitted
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
@@ -166,7 +166,7 @@ def fit_in(world: World, seed: int, jobs: int) -> tuple[FactorFit, Array]:
     true = FACTOR ** rng.uniform(-1.0, 1.0, 2)
     parts = parts_of(wrong(world.scenario(), *true), world.runs, seed)
     parts = replace(parts, trials=[world.observed(trial, rng) for trial in parts.trials])
-    kf, groups = cs.get_filter("kf"), groups_of("Q,R", parts.belief)
+    kf, groups = cs.get_filter("kf"), noise_groups_of("Q,R", parts.belief)
     with BeliefScorer(kf, parts.trials, parts.belief, jobs) as scorer:
         scorer.compile()
         fit = fitted(scorer, parts.belief, groups, parts.world.name)
@@ -178,7 +178,7 @@ def speed(options: argparse.Namespace) -> None:
     for world, name in SPEED:
         scenario = cs.load_scenario(world)
         trials = [cs.simulate(scenario, run, options.seed) for run in range(SPEED_RUNS)]
-        groups = groups_of("Q,R", scenario.belief)
+        groups = noise_groups_of("Q,R", scenario.belief)
         with BeliefScorer(cs.get_filter(name), trials, scenario.belief, options.jobs) as bench:
             bench.compile()
             began = time.monotonic()

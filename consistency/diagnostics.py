@@ -7,7 +7,7 @@ from consistency.referee.diagnostics.maps.rejected_observations import clustered
 from consistency.referee.diagnostics.monitoring.monitor import Alarm, Monitor
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.planning.pilot import PilotPlan, pilot_plan
-from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
+from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import Hotelling, hotelling, t_squared
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.independence import Independence, independence
@@ -23,9 +23,14 @@ from consistency.referee.diagnostics.questions.shape import (
     sphericity,
 )
 from consistency.referee.diagnostics.records.record import Evidence, JointNees, MapRecord, Record, Rejections
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.records.whitening import spread_steps, standardise, whiten
-from consistency.referee.diagnostics.statistics.accuracy import coverage, coverage_interval, noncredibility, rmse
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import (
+    coverage,
+    coverage_interval,
+    noncredibility,
+    rmse,
+)
 from consistency.referee.diagnostics.statistics.nees import (
     EProcess,
     Pit,

@@ -6,7 +6,9 @@ Only the stages and the chain need OpenCV, the extra ``vision``.
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.stereo.rendered_images.calibration import (
+    from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
+    from consistency.stereo.rendered_images.chain import Chain, Tracks
+    from consistency.stereo.rendered_images.sensor_tables import (
         Biases,
         Growth,
         TrackMeans,
@@ -14,8 +16,6 @@ with explained_import(__name__):
         disparity_growth,
         track_means,
     )
-    from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-    from consistency.stereo.rendered_images.chain import Chain, Tracks
     from consistency.stereo.rendered_images.stops import Stops, stand
 
 __all__ = [

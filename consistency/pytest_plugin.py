@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.referee.gating.session import PROPERTY, STATISTICS, Ledger, path_fault, to_property
-from consistency.referee.gating.watch import DEFAULTS, Entry, RunningTest, current, in_place_rate, watching
+from consistency.referee.gating.gate_terms import DEFAULTS, Entry, RunningTest, current, in_place_rate, watching
+from consistency.referee.gating.session_ledger import PROPERTY, STATISTICS, Ledger, path_fault, to_property
 
 NAME = "consistency-gates"
 MARKER = (
@@ -161,7 +161,7 @@ class Gates:
             if session.exitstatus == pytest.ExitCode.OK:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
         if self.path is not None and not self.config.option.collectonly:
-            from consistency.referee.gating.report import write_gates
+            from consistency.referee.gating.gates_report import write_gates
 
             write_gates(self.ledger, self.path)
 
@@ -176,7 +176,7 @@ class Gates:
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         if self.ledger.tests:
-            from consistency.referee.gating.report import gate_lines
+            from consistency.referee.gating.gates_report import gate_lines
 
             terminalreporter.section("consistency gates")
             for line in gate_lines(self.ledger):

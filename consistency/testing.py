@@ -15,10 +15,10 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.gating.candidates import Sides, of_arrays, of_filters
+from consistency.referee.gating.candidate_and_reference import Sides, of_arrays, of_filters
 from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
-from consistency.referee.gating.found import GateResult, entry_of, marker_text, runs_to_decide
-from consistency.referee.gating.watch import (
+from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide
+from consistency.referee.gating.gate_terms import (
     Terms,
     current,
     fault_text,
@@ -30,7 +30,7 @@ from consistency.referee.gating.watch import (
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Source
+    from consistency.referee.verdicts.judge_sources import Source
 
 
 class ConsistencyError(AssertionError):

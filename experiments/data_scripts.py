@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import consistency as cs
-from consistency.bench.runs.findings import findings_table
+from consistency.bench.runs.reproduce_findings import findings_table
 from consistency.referee.show.terminal import show
 from consistency.referee.system.folders import require_free
 

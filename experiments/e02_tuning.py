@@ -6,8 +6,8 @@ import numpy as np
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import script
-from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.bench.runs.reproduce_findings import script
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
 KERNELS = {"herath2007-xyz": ("ekf-xyz",)}

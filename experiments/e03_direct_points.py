@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.bench.runs.findings import script
+from consistency.bench.runs.reproduce_findings import script
 from consistency.diagnostics import detectable_ratio, simultaneous_band
 
 FINDINGS = ("fig11a",)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import consistency as cs
-from consistency.bench.runs.findings import script
-from consistency.bench.runs.run_scores import mean_nees_of_runs, wins
+from consistency.bench.runs.reproduce_findings import script
+from consistency.bench.runs.scores_by_run import mean_nees_of_runs, wins
 
 FINDINGS = ("fig11b", "fig13a", "fig13b", "consistent-stereo")
 

@@ -8,7 +8,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.models.stereo import project, triangulate, triangulate_jacobian
-from consistency.bench.runs.findings import script
+from consistency.bench.runs.reproduce_findings import script
 from consistency.diagnostics import Normality, normality
 
 FINDINGS = ("fig12a", "fig12b")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import consistency as cs
-from consistency.bench.runs.findings import script
-from consistency.bench.runs.run_scores import mean_nees_of_runs
+from consistency.bench.runs.reproduce_findings import script
+from consistency.bench.runs.scores_by_run import mean_nees_of_runs
 
 FINDINGS = ("baseline-reduces-nonlinearity",)
 KERNELS = {"herath2007-stereo": ("ekf-xyz", "ekf-uvd")}

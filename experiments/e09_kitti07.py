@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -25,14 +25,14 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.recorded_log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.diagnostics import anees_interval, chi2_mean_interval
-from consistency.referee.diagnostics.statistics.accuracy import coverage
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import coverage
 from consistency.referee.system.provenance import manifest_of
 from consistency.referee.types import Array
 
@@ -181,7 +181,7 @@ def run_all(logs: dict[str, Log], jobs: int) -> dict[str, Results]:
     print(f"e09: {len(tasks)} runs", file=sys.stderr, flush=True)
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(run_log, logs[log], [name], 1) for log, name in tasks]
-        done = [(log, future.result()) for (log, _), future in zip(tasks, futures, strict=True)]
+        done = [(log, cast(cs.Results, future.result())) for (log, _), future in zip(tasks, futures, strict=True)]
     return {name: joined([part for log, part in reversed(done) if log == name]) for name in logs}
 
 

@@ -13,16 +13,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.store.log import Log, write_log
+from consistency.bench.store.recorded_log import Log, write_log
 from consistency.referee.system.provenance import manifest_of
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def measure(study: cs.Study, logs: dict[str, Drive]) -> list[cs.Finding]:
     rows, findings = [], []
     for name, drive in logs.items():
         print(f"{name}: {', '.join(FILTERS)}", file=sys.stderr, flush=True)
-        results = study.kept[name] = run_log(drive.log, FILTERS, study.jobs)
+        results = study.kept[name] = cast(cs.Results, run_log(drive.log, FILTERS, study.jobs))
         verdicts = cs.analyse(results)
         here = [row(name, filter_, verdicts[filter_], record_of(results, filter_).in_world) for filter_ in FILTERS]
         rows += here

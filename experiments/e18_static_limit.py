@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special, stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
+from consistency.bench.runs.reproduce_findings import OURS, script
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 from scipy.stats import bootstrap
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
-from consistency.bench.runs.run_scores import mean_nees_of_runs
+from consistency.bench.runs.reproduce_findings import OURS, script
+from consistency.bench.runs.scores_by_run import mean_nees_of_runs
 from consistency.bench.scenario.effects.distortion import Distortion
 from consistency.referee.types import Array
 

@@ -15,7 +15,8 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script, sibling
+from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import OURS, script
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array

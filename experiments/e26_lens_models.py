@@ -19,8 +19,8 @@ import pandas as pd
 from scipy.stats import ttest_rel
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, script
-from consistency.bench.runs.run_scores import mean_nees_of_runs
+from consistency.bench.runs.reproduce_findings import OURS, script
+from consistency.bench.runs.scores_by_run import mean_nees_of_runs
 from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each

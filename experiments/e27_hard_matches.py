@@ -21,7 +21,8 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.findings import OURS, command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
+from consistency.bench.runs.reproduce_findings import OURS
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv

@@ -14,9 +14,9 @@ import consistency as cs
 from consistency.bench.filters.methods.robocentric import compiled
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
-from consistency.bench.runs.findings import script
+from consistency.bench.runs.reproduce_findings import script
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.run_scores import log_rmse, mean_nees_of_runs
+from consistency.bench.runs.scores_by_run import log_rmse, mean_nees_of_runs
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.types import Array
-from consistency.stereo.frontend.dataset_truth import read_truth
+from consistency.stereo.frontend.camera_truth import read_truth
 from consistency.stereo.frontend.planar_log import relative
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_opencv
 from consistency.stereo.visual_odometry.odometry import visual_odometry

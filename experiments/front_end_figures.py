@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from consistency.referee.document.colours import COLOURS, DASHES, TRUTH, Look
-from consistency.referee.show.painting import WIDTH, canvas, dots, path, points
+from consistency.referee.show.matplotlib_style import WIDTH, canvas, dots, path, points
 from consistency.referee.show.svg import png
 from consistency.referee.types import Array
 

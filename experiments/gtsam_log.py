@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.runs.findings import command_line, sibling
+from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
-from consistency.bench.store.log import write_log
+from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import require_free

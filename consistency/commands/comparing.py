@@ -25,9 +25,9 @@ from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.records.skipping import Skip as FirstSteps
+    from consistency.referee.diagnostics.records.skipped_start import Skip as FirstSteps
     from consistency.referee.verdicts.baselines import Baseline
-    from consistency.referee.verdicts.sources import Source
+    from consistency.referee.verdicts.judge_sources import Source
 
 
 @reads_files(without=GROUPED)
@@ -55,7 +55,7 @@ def compare_command(
     """Compare a filter with another, or with an earlier version. On the same trials, the comparison is run by run."""
     from consistency.referee.verdicts.baselines import is_baseline
     from consistency.referee.verdicts.compare_sources import compare_filters, compare_with, comparison_document
-    from consistency.referee.verdicts.sources import skip_asked
+    from consistency.referee.verdicts.judge_sources import skip_asked
 
     require_word("--fail-on", fail_on, "worse")
     if not 0.0 < false_alarm < 1.0:

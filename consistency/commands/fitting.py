@@ -153,7 +153,7 @@ def correct_command(
     from consistency.referee.fit_covariance.correction_text import correction_document
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.system.folders import require_free
-    from consistency.referee.verdicts.sources import skip_asked
+    from consistency.referee.verdicts.judge_sources import skip_asked
 
     require_word("--per", per, "axis")
     require_word("--fail-on", fail_on, "inconsistent")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,7 +35,7 @@ from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
 
 if TYPE_CHECKING:
-    from consistency.referee.verdicts.sources import Source
+    from consistency.referee.verdicts.judge_sources import Source
 
 
 @reads_files
@@ -92,7 +92,7 @@ def analyse_command(
     """Check whether stated covariances match the errors. Explain the verdict."""
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import FORMATS
-    from consistency.referee.verdicts.sources import files_source, judge_all, settings_of, skip_asked
+    from consistency.referee.verdicts.judge_sources import files_source, judge_all, settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -180,7 +180,7 @@ def report_command(
 ) -> None:
     """Write a report as one offline HTML file and a PDF."""
     from consistency.referee.pages.write_pages import require_pages, write_file_pages
-    from consistency.referee.verdicts.sources import files_source, judge_all
+    from consistency.referee.verdicts.judge_sources import files_source, judge_all
 
     estimates = are_files(path, files)
     stem = path.with_name(f"{path.stem}-report") if estimates else path / "report"
@@ -230,6 +230,7 @@ def plan_command(
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.needed_runs import plan_lines
+    from consistency.referee.verdicts.planned_runs import pilots_of_records
     from consistency.referee.verdicts.planned_runs import plan as plan_runs
 
     if scenario is not None and like is not None:
@@ -238,21 +239,25 @@ def plan_command(
         raise InputError("--filter goes with a SCENARIO or --like RESULTS")
     if scenario is not None and not filters:
         raise InputError(f"--filter: name the filter to plan for in {scenario}")
-    pilots, pilot_dof = None, len(POSE)
+    pilots: dict[str, Any] | None = None
+    pilot_dof = len(POSE)
     if like is not None and are_files(like, Reading()):
-        from consistency.referee.verdicts.planned_runs import pilots_of_records
-
         pilots, pilot_dof = pilots_of_records(read_files(like, Reading()), filters)
         dof = pilot_dof
-    elif like is not None:
-        from consistency.bench.runs.sequential import pilots_in
-
-        pilots = pilots_in(like, filters)
-    elif scenario is not None and filters:
+    elif like is not None or (scenario is not None and filters):
         plan_runs(dof, detect, false_alarm, power, allow, lost=lost, groups=groups)  # refuse before the work
-        from consistency.bench.runs.sequential import pilots_in_world
+        from consistency.bench.runs import montecarlo, results_to_records
+        from consistency.bench.scenario import load_scenario
+        from consistency.bench.store.results import Tables, open_results
 
-        pilots = pilots_in_world(scenario, filters, pilot_runs, seed)
+        results: Tables
+        if like is not None:
+            results = open_results(like)
+        else:
+            results = montecarlo.run_trials(load_scenario(str(scenario)), filters or (), pilot_runs, seed)
+        pilots = {}
+        for record in results_to_records.records_of_results(results, filters):  # one in memory at a time
+            pilots |= pilots_of_records([record])[0]
     planned = plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
     if as_json:
         print(json.dumps(planned, indent=2))

@@ -84,7 +84,7 @@ def monte_carlo_command(
     from consistency.referee.programs.study import Plan, run_study
     from consistency.referee.programs.words import inputs_of, program_of
     from consistency.referee.readers.pipeline.program_runs import failures_in_words
-    from consistency.referee.verdicts.sources import settings_of, skip_asked
+    from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -102,7 +102,7 @@ def monte_carlo_command(
     records, verdicts = run_study(program, plan, out, estimates, files, resume, overwrite)
     tell_notes(records)
     tell(failures_in_words(records, out))
-    shown = document(verdicts, out.name)
+    shown = document(verdicts, program.name)
     print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
     if not as_json:
         print_next("runs", out)

@@ -48,10 +48,10 @@ def sweep_command(
     ] = False,
 ) -> None:
     """Run filters over a grid of scenarios; map the verdicts. Each cell is run until decided."""
-    from consistency.bench.runs.backends.choosing import executor_for
-    from consistency.bench.sweeps.plan import load_sweep
-    from consistency.bench.sweeps.regime import regime_of, write_regime
-    from consistency.bench.sweeps.running import run_sweep
+    from consistency.bench.runs.backends.choose_executor import executor_for
+    from consistency.bench.sweeps.regime_map import regime_of, write_regime
+    from consistency.bench.sweeps.run_sweep import run_sweep
+    from consistency.bench.sweeps.sweep_file import load_sweep
     from consistency.bench.sweeps.sweep_folder import open_sweep
 
     if out is None and Path(source).is_dir():
@@ -65,7 +65,7 @@ def sweep_command(
         with executor_for(backend, jobs, scheduler, slurm or (), scheduler_wait, out) as executor:
             folder = run_sweep(plan, out, overwrite, jobs, executor=executor)
     from consistency.bench.pages import write_regime_reports
-    from consistency.bench.sweeps.printing import regime_blocks
+    from consistency.bench.sweeps.regime_map import regime_blocks
     from consistency.referee.show import terminal
 
     regime = regime_of(folder)
@@ -109,13 +109,13 @@ def tune_command(
 ) -> None:
     """Fit Q and R of a filter, and judge it before and after. The verdicts are on data that the fit has not seen."""
     from consistency.bench.scenario import load_scenario
-    from consistency.bench.store.log import read_log
-    from consistency.bench.tuning.result import KIND, tuning_data, tuning_lines, tuning_verdicts, write
+    from consistency.bench.store.recorded_log import read_log
     from consistency.bench.tuning.tune import tune as tune_filter
+    from consistency.bench.tuning.tuning_result import KIND, tuning_data, tuning_lines, tuning_verdicts, write
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
-    from consistency.referee.verdicts.sources import settings_of
+    from consistency.referee.verdicts.judge_sources import settings_of
 
     require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):
@@ -186,7 +186,7 @@ def challenge_command(
         Plan,
         challenge_data,
         challenge_lines,
-        require_writable,
+        require_scenario_file,
         write_scenario,
     )
     from consistency.bench.challenging.challenge import challenge as challenge_filter
@@ -196,7 +196,7 @@ def challenge_command(
         minutes = 5.0
     plan = Plan(minutes, trials, seed, jobs, false_alarm, detect)
     out = Path(f"challenge-{filter_name}.toml") if out is None else out
-    require_writable(out, overwrite)
+    require_scenario_file(out, overwrite)
     outcome = challenge_filter(filter_name, scenario, plan, within or [])
     if outcome.found:
         write_scenario(outcome, out)

@@ -91,12 +91,13 @@ def run_command(
     slurm: SlurmOptions = None,
 ) -> None:
     """Run filters on simulated trials or a recorded log."""
+    from consistency.bench.filters.filter_declarations import resolve_filters
     from consistency.bench.runs.analyse_results import analyse
-    from consistency.bench.runs.backends.choosing import executor_for
-    from consistency.bench.runs.montecarlo import resolve_filters, run_log, run_trials
-    from consistency.bench.runs.sequential import run_until_decided
+    from consistency.bench.runs.backends.choose_executor import executor_for
+    from consistency.bench.runs.montecarlo import run_log, run_trials
+    from consistency.bench.runs.run_until_decided import run_until_decided
     from consistency.bench.scenario import load_scenario
-    from consistency.bench.store.log import read_log
+    from consistency.bench.store.recorded_log import read_log
     from consistency.bench.store.results import Results, StoredResults
     from consistency.referee.document.judged_filters import document
     from consistency.referee.show import terminal
@@ -163,8 +164,8 @@ def reproduce_command(
 ) -> None:
     """Re-run the published findings and compare. Exit with status 1 if a published one is not reproduced."""
     from consistency.bench.pages import write_reports
-    from consistency.bench.runs.findings import findings_table
-    from consistency.bench.runs.findings import reproduce as reproduce_findings
+    from consistency.bench.runs.reproduce_findings import findings_table
+    from consistency.bench.runs.reproduce_findings import reproduce as reproduce_findings
     from consistency.bench.types import OURS, outcome
     from consistency.referee.show import terminal
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.sections.exhibits import extra_table
+from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import ACCEPTED, BAND, EXPECTED, LIMIT, REJECTED, style
 from consistency.referee.errors import InputError
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     add_legend,
     canvas,
     dots,

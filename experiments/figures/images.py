@@ -14,11 +14,19 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.pages.sections.exhibits import Exhibit, Source, groups, listing, several, shown, single
+from consistency.bench.pages.sections.published_findings import (
+    Exhibit,
+    Source,
+    exhibit_blocks,
+    groups,
+    listing,
+    several,
+    single,
+)
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, Look, style
-from consistency.referee.show.painting import curve, dots, log_axis, stroke
+from consistency.referee.show.matplotlib_style import curve, dots, log_axis, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -281,4 +289,4 @@ EXHIBITS = (
 
 def blocks(report: Report) -> tuple[Block, ...]:
     """The exhibits whose tables the folder holds."""
-    return shown(report, EXHIBITS)
+    return exhibit_blocks(report, EXHIBITS)

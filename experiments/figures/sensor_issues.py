@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from consistency.bench.pages.sections.exhibits import (
+from consistency.bench.pages.sections.published_findings import (
     P_VALUE,
     STATUS,
     Exhibit,
     Source,
+    exhibit_blocks,
     groups,
     listing,
     several,
-    shown,
     single,
 )
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Block, Figure, Table
 from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
-from consistency.referee.show.painting import curve, edges, log_axis, stroke
+from consistency.referee.show.matplotlib_style import curve, edges, log_axis, stroke
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -272,4 +272,4 @@ EXHIBITS = (
 
 def blocks(report: Report) -> tuple[Block, ...]:
     """The exhibits whose tables the folder holds."""
-    return shown(report, EXHIBITS)
+    return exhibit_blocks(report, EXHIBITS)

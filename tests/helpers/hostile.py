@@ -22,8 +22,8 @@ from flight import Flight
 from scipy.io import savemat
 
 import consistency as cs
-from consistency.bench.store.log import read_log
-from consistency.bench.store.trial_rows import Rejected, noted_table
+from consistency.bench.store.recorded_log import read_log
+from consistency.bench.store.trial_tables import Rejected, noted_table
 from consistency.commands import main
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.system.provenance import manifest_of
@@ -296,20 +296,20 @@ def _scenario(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    from consistency.bench.sweeps.plan import load_sweep
+    from consistency.bench.sweeps.sweep_file import load_sweep
 
     print([cell.scenario.hash for cell in load_sweep(folder / "sweep.toml").cells])
 
 
 def _findings(folder: Path) -> None:
-    from consistency.bench.runs.findings import read_findings
+    from consistency.bench.runs.reproduce_findings import read_findings
 
     print(read_findings(folder))
 
 
 def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
     def read(folder: Path) -> None:
-        from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
+        from consistency.stereo.frontend.camera_truth import find_truth, read_truth
         from consistency.stereo.visual_odometry.sequence import read_sequence
 
         sequence = read_sequence(folder, None if calibration is None else folder / calibration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from consistency.bench.runs.findings import figure_scripts, sibling
+from consistency.bench.runs.experiment_scripts import figure_scripts, sibling
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 

@@ -14,7 +14,7 @@ import pytest
 import consistency as cs
 from consistency.bench.filters import MODULES, usable_names
 from consistency.bench.filters.believed_noise import sensor_noise
-from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.scenario import BelievedSensor, BiasMap
 from consistency.bench.types import Gaussian
 from consistency.referee.types import Array

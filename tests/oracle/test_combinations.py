@@ -30,7 +30,7 @@ from consistency.bench.filters.kernel.part_functions import (
 from consistency.bench.filters.kernel.unicycle import Unicycle, move
 from consistency.bench.filters.kernel.update_steps import linearise_seen, make_work
 from consistency.bench.filters.methods.ideal import AtTruth
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState, view
 

@@ -6,7 +6,7 @@ import pytest
 from estimates import apart
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
+from consistency.bench.filters.run_filter import run_filter
 
 MERWE = {"belief__sigma_points": {"alpha": 0.5, "beta": 2.0, "kappa": 1.0}}
 CASES = [

@@ -13,7 +13,7 @@ from scipy.stats import truncnorm
 
 import consistency as cs
 from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, usable_names
-from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, heading_matrix
 from consistency.bench.models import motion, point, stereo

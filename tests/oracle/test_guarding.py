@@ -17,7 +17,7 @@ from consistency.bench.filters.guard.kernel_guard import guard_part, keep_agreei
 from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_watch
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Observation
 

@@ -5,7 +5,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.kernel.linalg import ROUNDING
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 
 MANY = {"truth__landmarks__count": 600, "truth__steps": 25}
 

@@ -6,7 +6,7 @@ from bench_trials import growing, grown
 from estimates import apart
 
 import consistency as cs
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 
 NEVER = 10**9
 ALL = [

@@ -16,7 +16,7 @@ from consistency.bench.filters.parts.invariant_pose import bend
 from consistency.bench.filters.parts.inverse_range import Pixels, curvature
 from consistency.bench.filters.parts.parking import Parking, _is_worth_it, make_clones, unpark
 from consistency.bench.filters.parts.sensors import Growth
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook import inverse_range, robocentric_state
 from consistency.bench.filters.textbook import robocentric as textbook
 from consistency.bench.filters.textbook.basics import heading_matrix

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook.submaps import SubmapKalman, joined_map
 from consistency.bench.protocols import Problem
 

@@ -7,7 +7,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.kernel.loop import trial_kernel
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook.ukf import CUBATURE, sigma_points
 from consistency.bench.simulation import planned_path
 

@@ -11,7 +11,7 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.groups import se3_log, spatial_error
+from consistency.referee.geometry.lie_groups import se3_log, spatial_error
 from consistency.referee.readers.formats.sheet import read_sheet
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.findings import reproduce
+from consistency.bench.runs.reproduce_findings import reproduce
 from consistency.bench.runs.results_to_records import record_of
 
 REFERENCE = Path(__file__).parents[2] / "reports" / "reference"

@@ -22,12 +22,12 @@ from document_inputs import NOT_RUN
 from documents import PAGES, PROGRAMS, ROOT, SHELL, blocks, commands, parsed, read, typed
 
 import consistency as cs
-from consistency.bench.challenging.worlds import space_of
+from consistency.bench.challenging.world_space import space_of
 from consistency.bench.filters import filter_names
 from consistency.bench.filters.guard.plain_rules import KINDS
-from consistency.bench.runs.findings import experiments
+from consistency.bench.runs.experiment_scripts import experiments
 from consistency.bench.scenario import data_folder, scenario_names
-from consistency.bench.sweeps.plan import load_sweep, sweep_names
+from consistency.bench.sweeps.sweep_file import load_sweep, sweep_names
 
 PYTHON = ("python", "python notebook")
 SITE = re.compile(r"\{[\w-]+\}.*")  # directives of the site

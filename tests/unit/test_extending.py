@@ -125,7 +125,7 @@ def test_the_renderer_of_the_document_works(copy):
     heads, cells, *_ = (copy / "out.csv").read_text().splitlines()
     assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
-    imports = "from pathlib import Path\nfrom consistency.referee.gating.session import path_fault"
+    imports = "from pathlib import Path\nfrom consistency.referee.gating.session_ledger import path_fault"
     refusal = f"{imports}\nprint(path_fault(Path('a.b')))"
     assert ".csv" in python(copy, refusal).stdout
 

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.challenging.search import RUNGS, Budget, ScoredWorld, ranked, search
 from consistency.bench.challenging.world_scores import ChallengeScorer
-from consistency.bench.challenging.worlds import Point, Space, require_right_belief, space_of
+from consistency.bench.challenging.world_space import Point, Space, require_right_belief, space_of
+from consistency.bench.challenging.worst_point_search import RUNGS, Budget, ScoredWorld, ranked, search
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.stepping import name_of
+from consistency.bench.filters.filter_declarations import name_of, resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.montecarlo import resolve_filters, run_trials
+from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.scenario import Scenario, load_scenario, scenario_text
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
@@ -31,7 +31,7 @@ from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.errors import InputError
 from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
-from consistency.referee.verdicts.sources import refused
+from consistency.referee.verdicts.judge_sources import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
 SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a fault in: errors that are too large
@@ -140,7 +140,7 @@ def challenge(
     Parameters
     ----------
     base : the scenario whose values are the plain ones; None for the first of :data:`BASES` that fits the filter
-    within : bounds of dimensions, see ``consistency.bench.challenging.worlds.space_of``
+    within : bounds of dimensions, see ``consistency.bench.challenging.world_space.space_of``
 
     Raises
     ------
@@ -279,9 +279,9 @@ def challenge_lines(outcome: Challenge, out: Path) -> list[str]:
         tested += f", of which {len(verdict.failures)} broke down"
     world = f"{outcome.space.text(outcome.point)}: ratio {outcome.ratio:.3g} in a typical run of the search"
     if not outcome.found:
-        given = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
+        budget_text = f"{plan.minutes:g} minutes" if plan.minutes is not None else f"{plan.trials} trials"
         return [
-            f"{name}: no world found within {given} in which it is overconfident",
+            f"{name}: no world found within {budget_text} in which it is overconfident",
             f"  most overconfident: {world}",
             f"  that world: {tested}",
             f"  searched: {searched}; no proof that there is no such world",
@@ -330,7 +330,7 @@ def challenge_data(outcome: Challenge, out: Path) -> dict[str, Any]:
     }
 
 
-def require_writable(out: Path, overwrite: bool) -> None:
+def require_scenario_file(out: Path, overwrite: bool) -> None:
     """Refuse a file that cannot be written, before the search.
 
     Raises

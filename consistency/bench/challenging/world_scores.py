@@ -11,13 +11,13 @@ import numpy as np
 
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.backends.threads import worker_count
-from consistency.bench.runs.compiling import compile_all, first_trials
 from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs.local_workers import worker_count
+from consistency.bench.runs.missing_kernels import compile_all, first_trials
+from consistency.bench.runs.run_outcome import outcome_of
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.trial_rows import outcome_of
 from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
 

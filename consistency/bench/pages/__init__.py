@@ -1,7 +1,7 @@
 """Pages on results of the bench and on maps of worlds.
 
-``build`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each of which
-is described once.
+``results_report`` reads a folder and lets every section of ``sections`` make its blocks: text, tables and figures, each
+of which is described once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from consistency.referee.pages.write_pages import require_pages, require_writable, write_document
 
 if TYPE_CHECKING:
-    from consistency.bench.sweeps.regime import Regime
+    from consistency.bench.sweeps.regime_map import Regime
 
 __all__ = ["write_regime_reports", "write_reports"]
 
@@ -39,7 +39,7 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
 
     manifest = read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
-    from consistency.bench.pages.build import build_report, compose, folders_of
+    from consistency.bench.pages.results_report import build_report, compose, folders_of
     from consistency.referee.system.progress import progress
 
     parts = len(folders_of(Path(folder), manifest)) + sum(path is not None for path in (html, pdf))
@@ -59,7 +59,7 @@ def write_regime_reports(regime: Regime, folder: Path) -> list[Path]:
     targets = [folder / "report.html", folder / "report.pdf"]
     for path in targets:
         require_writable(path, overwrite=True)
-    from consistency.bench.pages.maps_of_worlds import compose_regime
+    from consistency.bench.pages.sweep_report import compose_regime
 
     write_document(compose_regime(regime), *targets)
     return targets

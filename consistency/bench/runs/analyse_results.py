@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.verdicts.sources import Source, judge_all
+from consistency.referee.verdicts.judge_sources import Source, judge_all
 
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables

@@ -5,47 +5,31 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import pandas as pd
 
-from consistency.bench.filters import filter_names, get_filter, usable_names
-from consistency.bench.filters.stepping import error_of, name_of
+from consistency.bench.filters.filter_declarations import name_of, own_errors, resolve_filters
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.batches import ExecutorWorkers
-from consistency.bench.runs.campaign import PLAN, Campaign, ResultsPlace, own_errors, place_for
-from consistency.bench.runs.campaign import Interrupted as Interrupted
+from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.local_workers import LocalThreads
+from consistency.bench.runs.resume_results import PLAN, gathered_in
+from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted
+from consistency.bench.runs.rounds_of_runs import StudyRounds
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
-from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.scenario.tables.toml_tables import UNITS
+from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
-from consistency.bench.store.log import Log, require_format, write_log
+from consistency.bench.store.recorded_log import Log, require_format, write_log
 from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.errors import InputError
-from consistency.referee.parsing import require_name
 from consistency.referee.system.folders import require_free
-from consistency.referee.system.provenance import manifest_of, this_machine
+from consistency.referee.system.provenance import manifest_of
 
 
-# fmt: off
-@overload
-def run_trials(
-    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
-    timeout: float | None = ..., previous: Tables | None = ..., out: None = ..., overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
-) -> Results: ...
-@overload
-def run_trials(
-    scenario: Scenario, filters: Sequence[str | Filter], runs: int = ..., seed: int = ..., jobs: int = ...,
-    timeout: float | None = ..., previous: Tables | None = ..., *, out: str | Path, overwrite: bool = ...,
-    resume: bool = ..., memory: float | None = ..., executor: Executor | None = ...,
-) -> StoredResults: ...
-# fmt: on
 def run_trials(
     scenario: Scenario,
     filters: Sequence[str | Filter],
@@ -98,28 +82,11 @@ def run_trials(
     with studied(
         scenario, filters, seed, workers_for(jobs, executor), timeout, memory, out=out, previous=previous,
         resume=resume, overwrite=overwrite,
-    ) as campaign:  # fmt: skip
-        done = campaign.place.kept
-        is_resumed = campaign.place.journal is not None and campaign.place.journal.runs
-        if done and max(done) >= runs and not is_resumed:
-            raise InputError(f"runs must be at least {max(done) + 1}: so many are there already, got {runs}")
-        return campaign.finish([range(runs)])
+    ) as study_rounds:  # fmt: skip
+        study_rounds.gathered.require_more(runs)
+        return study_rounds.finish([range(runs)])
 
 
-# fmt: off
-@overload
-def run_log(
-    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., executor: Executor | None = ..., out: None = ..., resume: bool = ...,
-    overwrite: bool = ...,
-) -> Results: ...
-@overload
-def run_log(
-    log: Log, filters: Sequence[str | Filter], jobs: int = ..., timeout: float | None = ...,
-    memory: float | None = ..., executor: Executor | None = ..., *, out: str | Path, resume: bool = ...,
-    overwrite: bool = ...,
-) -> StoredResults: ...
-# fmt: on
 def run_log(
     log: Log,
     filters: Sequence[str | Filter],
@@ -141,8 +108,9 @@ def run_log(
     work = TrialWork(Recorded(trials), Isolation(instances, log.belief, timeout, memory))
     own = {"log_sha256": log.sha256} | ({"screening": log.screening} if log.screening else {})
     fields = {"seed": None, "log": log.name, "belief": log.belief.model_dump(mode="json")} | own
-    with place_for(_known(instances) | own, None if out is None else Path(out), None, resume, overwrite) as place:
-        return Campaign(workers_for(jobs, executor), work, place, fields, log.landmarks).finish([sorted(trials)])
+    place = None if out is None else Path(out)
+    with gathered_in(_known(instances) | own, place, None, resume, overwrite) as gathered:
+        return StudyRounds(workers_for(jobs, executor), work, gathered, fields, log.landmarks).finish([sorted(trials)])
 
 
 def workers_for(jobs: int, executor: Executor | None) -> Workers:
@@ -165,7 +133,7 @@ def studied(
     overwrite: bool,
     plan: Mapping[str, Any] | None = None,
     journal: Journal | None = None,
-) -> Iterator[Campaign]:
+) -> Iterator[StudyRounds]:
     """Runs of a scenario, continued from earlier ones; see :func:`run_trials`, which raises the same exceptions.
 
     Parameters
@@ -179,55 +147,14 @@ def studied(
     planned = {} if plan is None else {PLAN: dict(plan)}
     known = _known(instances) | {"scenario_hash": scenario.hash, "seed": seed} | planned
     fields = {"seed": seed} | _scenario_entry(scenario) | planned
-    with (
-        place_for(known, None if out is None else Path(out), previous, resume, overwrite)
-        if journal is None
-        else nullcontext(ResultsPlace(None, journal, None, frozenset(), [this_machine()]))  # results stay in memory
-    ) as place:
-        yield Campaign(workers, work, place, fields, _landmarks_table(scenario))
+    place = None if out is None else Path(out)
+    with gathered_in(known, place, previous, resume, overwrite, journal) as gathered:
+        yield StudyRounds(workers, work, gathered, fields, _landmarks_table(scenario))
 
 
 def _known(filters: Sequence[Filter]) -> dict[str, Any]:
     """What a resume must have in common, of the filters."""
     return {"filters": [name_of(f) for f in filters], "error": own_errors(filters)}
-
-
-def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | None = None) -> list[Filter]:
-    """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
-    instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
-    if not instances:
-        raise InputError(f"no filter given; known: {', '.join(filter_names())}")
-    for filter_ in instances:
-        if isinstance(filter_, type) or not isinstance(filter_, Filter):
-            hint = (
-                "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
-            )
-            raise InputError(f"{filter_!r} is not a filter: {hint}")
-    names = [name_of(f) for f in instances]
-    if len(set(names)) < len(names):
-        raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
-    built_in = filter_names()
-    for given, name in zip(filters, names, strict=True):
-        is_ours = isinstance(given, str) or type(given).__module__.startswith("consistency.")
-        if name in built_in and not is_ours:
-            raise InputError(f"filter '{name}': is a built-in filter; give yours another name")
-    model = belief.sensor.model
-    for filter_ in instances:
-        require_name(name_of(filter_), "filter")
-        error_of(filter_)
-        sensors = getattr(filter_, "sensors", None)
-        if sensors is not None and model not in sensors:
-            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
-            raise InputError(
-                f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
-                f"filters that fit: {', '.join(fitting)}"
-            )
-        for key in getattr(filter_, "needs", ()):
-            if getattr(belief.sensor, key) is None:
-                unit = f"{key}{UNITS.get(key, '')}"
-                place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
-                raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
-    return instances
 
 
 def simulate_log(

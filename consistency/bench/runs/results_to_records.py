@@ -26,13 +26,13 @@ from consistency.referee.parsing import LARGEST_NUMBER, one_line
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
 from consistency.referee.readers.formats.sheet import checked_dof
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Source
+from consistency.referee.verdicts.judge_sources import Source
 
 INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
 POINT = ("x", "y", "z")
 
 
-def records_of(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
+def records_of_results(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
     """A record for every filter of the results, or for those named, each read when it is asked for."""
     steps = longest_run(results)
     return (record_of(results, name, steps) for name in filters or results.filters)
@@ -48,15 +48,15 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
     """
     if filter_name not in results.filters:
         raise InputError(f"filter '{filter_name}' is not in these results; there are: {', '.join(results.filters)}")
-    broken = results.failures[results.failures["filter"] == filter_name]
+    failed_runs = results.failures[results.failures["filter"] == filter_name]
     convention, runs = results.error_of(filter_name), results.runs_of(filter_name)
     steps = longest_run(results) if steps is None else steps
     shape = len(runs), steps
     pose, covariance = np.full((*shape, 3), np.nan), np.full((*shape, 3, 3), np.nan)
-    own = None if convention == ADDITIVE else covariance.copy()
+    own_covariance = None if convention == ADDITIVE else covariance.copy()
     nis, nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
     nees = np.full(shape, np.nan) if results.has_truth else None
-    own_nees = None if own is None or nees is None else nees.copy()
+    own_nees = None if own_covariance is None or nees is None else nees.copy()
     t = np.full(steps, np.nan)
     for batch in results.batches("estimates", results.numbers_of(filter_name), filter_name):
         if (batch["step"] < 1).any():
@@ -68,25 +68,26 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
         nis.reshape(-1)[at], nis_dof.reshape(-1)[at], t[batch["step"] - 1] = batch["nis"], batch["nis_dof"], batch["t"]
         if nees is not None:
             nees.reshape(-1)[at] = batch["nees"]
-        if own is not None:
+        if own_covariance is not None:
             _require_own(batch, filter_name)
-            _fill(own, at, batch, OWN_COVARIANCE)
+            _fill(own_covariance, at, batch, OWN_COVARIANCE)
         if own_nees is not None:
             own_nees.reshape(-1)[at] = batch["own_nees"]
     failures = tuple(
-        Failure(filter_name, int(r), int(s), one_line(why, 2000)) for _, r, s, why in broken.itertuples(index=False)
+        Failure(filter_name, int(run), int(step), one_line(reason, 2000))
+        for _, run, step, reason in failed_runs.itertuples(index=False)
     )
     dof = len(POSE) if results.has_truth else 0
-    parts = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
+    record_with = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
-    world = parts(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
+    world = record_with(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
     _require_agreement(world)
-    _require_all(world, "nees", covariance if own is None else own)
+    _require_all(world, "nees", covariance if own_covariance is None else own_covariance)
     record = world
-    if own is not None:
-        record = parts(own_error, own, own_nees, convention=convention, world=world)
+    if own_covariance is not None:
+        record = record_with(own_error, own_covariance, own_nees, convention=convention, world=world)
         _require_agreement(record)
-        _require_all(record, "own_nees", own)
+        _require_all(record, "own_nees", own_covariance)
     _require_nis(filter_name, runs, nis, nis_dof)
     return replace(
         record, nis=nis, nis_dof=nis_dof, failures=failures, t=t,
@@ -98,8 +99,8 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
 
 def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
     """Where rows stand among the values of ``runs`` with ``steps`` each: a slice if one comes after the other."""
-    at = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
-    return slice(int(at[0]), int(at[-1]) + 1) if len(at) and (np.diff(at) == 1).all() else at
+    rows = np.searchsorted(runs, batch["run"]) * steps + batch["step"] - 1
+    return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) and (np.diff(rows) == 1).all() else rows
 
 
 def _fill(covariance: Array, at: Any, batch: Columns, columns: dict[str, tuple[int, int]]) -> None:
@@ -127,12 +128,12 @@ def _require_agreement(r: Record) -> None:
         too_large = np.abs(error) > np.sqrt(LARGEST_NUMBER * np.maximum(variance, 0.0))
         return np.asarray(np.isfinite(nees) & (too_large & (variance > 0)).any(axis=-1))
 
-    bad = by_runs(beyond, r.error, r.covariance, r.nees)
-    if bad.any():
-        row, step = np.argwhere(bad)[0]
+    impossible = by_runs(beyond, r.error, r.covariance, r.nees)
+    if impossible.any():
+        run_row, step = np.argwhere(impossible)[0]
         raise InputError(
-            f"estimates of '{r.name}', run {r.run_numbers[row]}, step {step + 1}: the NEES is not that of the error "
-            "and its covariance; the tables were changed or damaged; write them again"
+            f"estimates of '{r.name}', run {r.run_numbers[run_row]}, step {step + 1}: the NEES is not that of the "
+            "error and its covariance; the tables were changed or damaged; write them again"
         )
 
 
@@ -158,8 +159,10 @@ def _require_all(r: Record, column: str, covariance: Array) -> None:
 
 def _first_number(values: Array) -> Array:
     """Column of the first number in each row, the number of columns where none is."""
-    there = np.isfinite(values)
-    return np.where(there.any(axis=1), there.argmax(axis=1), values.shape[1]) if values.size else np.zeros(len(values))
+    is_number = np.isfinite(values)
+    if not values.size:
+        return np.zeros(len(values))
+    return np.asarray(np.where(is_number.any(axis=1), is_number.argmax(axis=1), values.shape[1]))
 
 
 def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) -> None:
@@ -174,15 +177,15 @@ def _require_nis(filter_name: str, runs: Indices, nis: Array, nis_dof: Indices) 
 
 def _errors(results: Tables, runs: Indices, pose: Array, t: Array, convention: str = ADDITIVE) -> Array:
     """Errors in the place of ``pose``; NaN without truth. Fills ``t`` where every run had failed."""
-    known = np.zeros(pose.shape[:2], bool)
+    has_truth = np.zeros(pose.shape[:2], bool)
     for batch in results.batches("truth", list(COLUMNS["truth"])):
-        rows = (batch["step"] > 0) & np.isin(batch["run"], runs)
-        row, column = np.searchsorted(runs, batch["run"][rows]), batch["step"][rows] - 1
-        t[column] = np.where(np.isnan(t[column]), batch["t"][rows], t[column])
-        true = np.stack([batch[axis][rows] for axis in POSE], axis=-1)
-        pose[row, column] = planar_error(true, pose[row, column], convention)
-        known[row, column] = True
-    pose[~known] = np.nan
+        after_start = (batch["step"] > 0) & np.isin(batch["run"], runs)
+        row, column = np.searchsorted(runs, batch["run"][after_start]), batch["step"][after_start] - 1
+        t[column] = np.where(np.isnan(t[column]), batch["t"][after_start], t[column])
+        true_pose = np.stack([batch[axis][after_start] for axis in POSE], axis=-1)
+        pose[row, column] = planar_error(true_pose, pose[row, column], convention)
+        has_truth[row, column] = True
+    pose[~has_truth] = np.nan
     return pose
 
 
@@ -222,24 +225,34 @@ def map_of(
         judged = np.isfinite(rows["nees"])
         if not judged.any():
             return None
-        some: Any = slice(None) if judged.all() else judged  # a slice is not a copy
-        runs, row = np.unique(rows["run"][some], return_inverse=True)
-        labels, column = np.unique(rows["landmark"][some], return_inverse=True)
+        judged_rows: Any = slice(None) if judged.all() else judged  # a slice is not a copy
+        runs, row = np.unique(rows["run"][judged_rows], return_inverse=True)
+        labels, column = np.unique(rows["landmark"][judged_rows], return_inverse=True)
         nees = np.full((len(runs), len(labels)), np.nan)
-        nees[row, column] = rows["nees"][some]
+        nees[row, column] = rows["nees"][judged_rows]
         errors, covariances = np.full((*nees.shape, dof), np.nan), np.full((*nees.shape, dof, dof), np.nan)
-        errors[row, column] = error[some, :dof]
-        covariances[row, column] = covariance[some, :dof, :dof]
+        errors[row, column] = error[judged_rows, :dof]
+        covariances[row, column] = covariance[judged_rows, :dof, :dof]
         common = np.isfinite(nees).all(axis=0)
-        kept = common if common.any() else np.full(len(labels), True)
-        at: Any = slice(None) if kept.all() else kept
-        known = common.any() and bool(np.isfinite(errors[:, at]).all())
-        pose = None if last is None else last[np.searchsorted(of_poses, runs)]
+        landmarks_kept = common if common.any() else np.full(len(labels), True)
+        at: Any = slice(None) if landmarks_kept.all() else landmarks_kept
+        has_errors = common.any() and bool(np.isfinite(errors[:, at]).all())
+        joint_nees = None
+        if last is not None and joint is not None:
+            pose_nees = last[np.searchsorted(of_poses, runs)]
+            joint_nees = _joint(pose_nees, joint[judged_rows], dof, row, column, landmarks_kept)
         return Record(
-            filter_name, errors[:, at] if known else None, covariances[:, at] if known else None, nees[:, at], dof,
-            failures=failures, axes=POINT[:dof], runs=runs, landmarks=labels[kept],
-            joint=None if pose is None or joint is None else _joint(pose, joint[some], dof, row, column, kept),
-        )  # fmt: skip
+            filter_name,
+            errors[:, at] if has_errors else None,
+            covariances[:, at] if has_errors else None,
+            nees[:, at],
+            dof,
+            failures=failures,
+            axes=POINT[:dof],
+            runs=runs,
+            landmarks=labels[landmarks_kept],
+            joint=joint_nees,
+        )
 
     return MapRecord(rows["run"], rows["nees"], dof, record)
 
@@ -264,11 +277,11 @@ def _places(results: Tables, labels: Indices) -> Array:
     """True positions (M, 3) of landmarks (M,), m; NaN where they are not known."""
     places = np.full((len(labels), 3), np.nan)
     if results.landmarks is not None and len(results.landmarks):
-        table = results.landmarks.sort_values("landmark")
-        known = table["landmark"].to_numpy()
-        at = np.minimum(np.searchsorted(known, labels), len(known) - 1)
-        here = known[at] == labels
-        places[here] = table[list("xyz")].to_numpy()[at[here]]
+        landmark_table = results.landmarks.sort_values("landmark")
+        known_landmarks = landmark_table["landmark"].to_numpy()
+        nearest = np.minimum(np.searchsorted(known_landmarks, labels), len(known_landmarks) - 1)
+        is_known = known_landmarks[nearest] == labels
+        places[is_known] = landmark_table[list("xyz")].to_numpy()[nearest[is_known]]
     return places
 
 
@@ -299,13 +312,20 @@ def results_source(results: Tables | str | Path) -> Source:
         The folder is damaged; the records raise as :func:`record_of`.
     """
     tables = results if isinstance(results, Tables) else open_results(results)
-    m, steps = tables.manifest, cache(partial(longest_run, tables))
-    unfinished = "" if m.get("complete", True) else f"only {m['finished_runs']} of {m['runs']} runs are there"
+    manifest, steps = tables.manifest, cache(partial(longest_run, tables))
+    unfinished = ""
+    if not manifest.get("complete", True):
+        unfinished = f"only {manifest['finished_runs']} of {manifest['runs']} runs are there"
+    world = manifest.get("scenario_hash") or manifest.get("log_sha256")
     return Source(
-        tables.filters, lambda name: record_of(tables, name, steps()), partial(design_of, tables), tables.has_truth,
-        (m.get("scenario") or {}).get("name"), (m.get("scenario_hash") or m.get("log_sha256"), m.get("seed")),
-        unfinished,
-    )  # fmt: skip
+        tables.filters,
+        lambda name: record_of(tables, name, steps()),
+        partial(design_of, tables),
+        tables.has_truth,
+        scenario=(manifest.get("scenario") or {}).get("name"),
+        trials=(world, manifest.get("seed")),
+        unfinished=unfinished,
+    )
 
 
 def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> NisLog:
@@ -319,11 +339,11 @@ def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> Ni
     results = open_results(folder)
     name = choose(folder, "filter", results.filters, filter_name)
     run_number = choose(folder, "run", results.runs_of(name).tolist(), run)
-    parts = []
+    nis_parts = []
     for batch in results.batches("estimates", INNOVATIONS, name):
         rows = batch["run"] == run_number
-        parts.append(np.stack([batch[column][rows].astype(float) for column in INNOVATIONS[1:]]))
-    step, t, nis, dof = np.concatenate(parts, axis=1) if parts else np.empty((4, 0))
+        nis_parts.append(np.stack([batch[column][rows].astype(float) for column in INNOVATIONS[1:]]))
+    step, t, nis, dof = np.concatenate(nis_parts, axis=1) if nis_parts else np.empty((4, 0))
     if not len(step):
         raise InputError(f"{folder}: run {run_number} of '{name}' failed before its first estimate")
     order = np.argsort(step, kind="stable")

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.compiling import compile_all
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.memory_needed import workers_that_fit
+from consistency.bench.runs.missing_kernels import compile_all
+from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
 from consistency.bench.scenario import Scenario
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
-from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.bench.types import Trial
 
 Outcomes = Generator[RunOutcome, None, None]
@@ -32,21 +31,12 @@ class Simulated:
 
     scenario: Scenario
     seed: int
-    _ahead: dict[int, Trial] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _ = self._world
 
     def __call__(self, run: int) -> Trial:
-        trial = self._ahead.pop(run, None)
-        return self._world.trial(run, self.seed) if trial is None else trial
-
-    def ahead(self, run: int) -> Trial:
-        """The trial that is about to be run, kept until then."""
-        if run not in self._ahead:
-            self._ahead.clear()
-            self._ahead[run] = self._world.trial(run, self.seed)
-        return self._ahead[run]
+        return self._world.trial(run, self.seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Simulated, (self.scenario, self.seed)
@@ -90,25 +80,10 @@ class TrialWork:
             return self
         return replace(self, trials=Recorded({run: self.trials.trials[run] for run in runs}))
 
-    def _ahead(self, run: int) -> Trial:
-        ahead: Callable[[int], Trial] = getattr(self.trials, "ahead", self.trials)
-        return ahead(run)
-
-    def room_for(self, run: int, workers: int) -> int:
-        """As many of ``workers`` as have memory for a run; raises InputError where not even one has.
-
-        The runs of a scenario are alike, so that ``run`` speaks for all; of a log all are looked at.
-        """
-        if not self.isolation.compiled:
-            return workers
-        trials = list(self.trials.trials.values()) if isinstance(self.trials, Recorded) else [self._ahead(run)]
-        return workers_that_fit(trials, workers)
-
-    def compile(self, run: int, jobs: int = 1) -> None:
-        """Compile what a run needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
-        if self.isolation.compiled:
-            trial, belief = self._ahead(run), self.isolation.belief
-            compile_all(((filter_, trial, belief) for filter_ in self.isolation.compiled), jobs)
+    def compile(self, trial: Trial, jobs: int) -> None:
+        """Compile what a trial needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
+        belief = self.isolation.belief
+        compile_all(((filter_, trial, belief) for filter_ in self.isolation.compiled), jobs)
 
 
 class Workers(Protocol):

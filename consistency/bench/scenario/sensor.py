@@ -45,6 +45,13 @@ class BelievedSensor(StereoSensor):
             raise ValueError(f"bias is of a sensor 'uvd', not '{self.model}'; leave it out")
         return self
 
+    @property
+    def rig(self) -> tuple[float, float]:
+        """Focal length (px) and baseline (m) of a sensor ``uvd``."""
+        assert self.f is not None
+        assert self.B is not None
+        return self.f, self.B
+
 
 def _require_search_range(disparity: tuple[float, float]) -> None:
     if disparity[0] >= disparity[1]:

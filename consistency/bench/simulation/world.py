@@ -239,12 +239,12 @@ def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:
     """Eq. 18 to first order about the reference: error <- F error + G noise, exactly linear."""
     heading, (dt, v, _), (_, v_noise, omega_noise) = reference[:-1, 2], planned.T, noise.T
     turned = np.cumsum(dt * omega_noise)
-    before = np.concatenate([[0.0], turned[:-1]])
+    pose_before = np.concatenate([[0.0], turned[:-1]])
     along = dt * v_noise
     path = reference.copy()
     for axis, slope, share in zip(
         (0, 1), motion.unicycle_jacobian(heading, dt, v), (np.cos(heading), np.sin(heading)), strict=True
     ):
-        path[1:, axis] += np.cumsum(np.column_stack([slope * before, along * share]))[1::2]
+        path[1:, axis] += np.cumsum(np.column_stack([slope * pose_before, along * share]))[1::2]
     path[1:, 2] += turned
     return path

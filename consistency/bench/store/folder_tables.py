@@ -68,16 +68,16 @@ def require_unchanged(folder: Path, manifest: dict[str, Any]) -> None:
     InputError
         A table was edited, replaced or damaged, or is missing; the manifest names none of this bench.
     """
-    contents = manifest.get("contents", {})
-    if not isinstance(contents, dict) or not contents.keys() <= COLUMNS.keys():
+    written_contents = manifest.get("contents", {})
+    if not isinstance(written_contents, dict) or not written_contents.keys() <= COLUMNS.keys():
         raise InputError(f"{folder / 'manifest.json'}: key 'contents' must have tables as keys; write the folder again")
-    for name in contents:
+    for name in written_contents:
         path = folder / f"{name}.parquet"
         try:
-            content = _content_of(folder, name)
+            content_now = _content_of(folder, name)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-        if content != contents[name]:
+        if content_now != written_contents[name]:
             raise InputError(
                 f"{path}: is not as it was written, but damaged or edited; write the folder again, or, if the change "
                 f"is meant, take '{name}' out of the key 'contents' of manifest.json"

@@ -25,6 +25,7 @@ from consistency.referee.types import Array
 
 CHECKPOINT_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none
 DATABASE, EARLIER = "runs.sqlite", "journal"  # the second is of versions before SQLite
+IN_MEMORY = Path(":memory:")
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS study (content TEXT);
 CREATE TABLE IF NOT EXISTS finished (run INTEGER PRIMARY KEY, notes TEXT);
@@ -35,7 +36,7 @@ CREATE TABLE IF NOT EXISTS part (
 
 
 class Journal:
-    """Finished runs in an SQLite database.
+    """Finished runs in an SQLite database, in a file or ``IN_MEMORY``.
 
     A finished run is a row of ``finished`` and, for each of its tables, a row of ``part``: the names and types of the
     columns, and their numbers as they are in memory. Both are written in one transaction, so that a run is there
@@ -79,6 +80,10 @@ class Journal:
         self._database.executescript(SCHEMA)
 
     @property
+    def is_on_disk(self) -> bool:
+        return self.path != IN_MEMORY
+
+    @property
     def runs(self) -> set[int]:
         return set(self._runs)
 
@@ -102,12 +107,12 @@ class Journal:
         """Keep a finished run: its columns by the names of the parts, and ``notes``, which JSON can hold."""
         with self._transaction() as database:
             for name, columns in parts.items():
-                types = json.dumps({column: values.dtype.str for column, values in columns.items()})
+                column_types = json.dumps({column: values.dtype.str for column, values in columns.items()})
                 numbers = b"".join([values.tobytes() for values in columns.values()])
-                row = (run, name, types, numbers, zlib.crc32(numbers))
-                database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", row)
-            noted = json.dumps(dict(notes)) if notes else None
-            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted))
+                part_row = (run, name, column_types, numbers, zlib.crc32(numbers))
+                database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", part_row)
+            noted_json = json.dumps(dict(notes)) if notes else None
+            database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted_json))
         self._runs.add(run)
         if notes:
             self.notes[run] = dict(notes)
@@ -124,10 +129,10 @@ class Journal:
                 row = self._database.execute(query, (run, name)).fetchone()
             if row is None:
                 continue
-            types, numbers, checksum = row
+            column_types, numbers, checksum = row
             if zlib.crc32(numbers) != checksum:
                 raise self._damaged(f"run {run}")
-            yield run, _decode(numbers, json.loads(types))
+            yield run, _decode(numbers, json.loads(column_types))
 
     def close(self) -> None:
         with self._faults():
@@ -167,10 +172,10 @@ def _decode(numbers: bytes, types: Mapping[str, str]) -> Columns:
     """Return the columns of a part, all of one length."""
     rows = len(numbers) // sum(np.dtype(kind).itemsize for kind in types.values())
     columns: dict[str, Array] = {}
-    at = 0
+    offset = 0
     for name, kind in types.items():
-        columns[name] = np.frombuffer(numbers, kind, rows, at)
-        at += columns[name].nbytes
+        columns[name] = np.frombuffer(numbers, kind, rows, offset)
+        offset += columns[name].nbytes
     return columns
 
 

@@ -154,10 +154,10 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
     path, dtypes = folder / f"{name}.parquet", COLUMNS[name] | OPTIONAL.get(name, {})
     file = require_table(folder, name, columns)
     needed = [*columns, "filter"] if filter_name is not None else list(columns)
-    held = None if filter_name is None else _filters_of(path)
+    filters_of_groups = None if filter_name is None else _filters_of(path)
     first = 0
     for group in range(file.num_row_groups):
-        if held is not None and filter_name not in held[group]:
+        if filters_of_groups is not None and filter_name not in filters_of_groups[group]:
             first += file.metadata.row_group(group).num_rows
             continue
         with reading(path):
@@ -166,12 +166,12 @@ def read_batches(folder: Path, name: str, columns: Sequence[str], filter_name: s
                 for column, values in table.items():
                     values.name = column
                     check_column(path, values, dtypes[column], first)
-                mask: Any = slice(None)
+                of_filter: Any = slice(None)
                 if filter_name is not None:
                     _require_text(path, batch.column("filter"), first)
-                    mask = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
+                    of_filter = pc.equal(batch.column("filter"), filter_name).to_numpy(zero_copy_only=False)
                 first += batch.num_rows
-                yield {column: values.to_numpy(dtypes[column])[mask] for column, values in table.items()}
+                yield {column: values.to_numpy(dtypes[column])[of_filter] for column, values in table.items()}
     pa.default_memory_pool().release_unused()
 
 
@@ -184,8 +184,8 @@ def require_table(folder: Path, name: str, also: Sequence[str] = ()) -> Any:
     needed, names = dict.fromkeys((*COLUMNS[name], *also)), file.schema_arrow.names
     if missing := [column for column in needed if column not in names]:
         raise InputError(f"{path}: column '{missing[0]}' is missing; needed: {', '.join(needed)}")
-    if twice := [column for column in needed if names.count(column) > 1]:
-        raise InputError(f"{path}: column '{twice[0]}' is duplicated")
+    if repeated := [column for column in needed if names.count(column) > 1]:
+        raise InputError(f"{path}: column '{repeated[0]}' is duplicated")
     return file
 
 
@@ -215,14 +215,14 @@ def _filters_of(path: Path) -> tuple[frozenset[str], ...]:
 
 @functools.lru_cache(maxsize=16)
 def _filters_read(path: Path, mtime_ns: int, size: int) -> tuple[frozenset[str], ...]:
-    file, first, found = open_parquet(path), 0, []
+    file, first, filters_of_groups = open_parquet(path), 0, []
     for group in range(file.num_row_groups):
         with reading(path):
             names = file.read_row_group(group, ["filter"]).column("filter")
         _require_text(path, names, first)
-        found.append(frozenset(pc.unique(names).to_pylist()))
+        filters_of_groups.append(frozenset(pc.unique(names).to_pylist()))
         first += len(names)
-    return tuple(found)
+    return tuple(filters_of_groups)
 
 
 def _require_text(path: Path, names: Any, first: int = 0) -> None:
@@ -252,9 +252,9 @@ def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) 
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
     largest = MOST_DOF - 1 if column.name == "nis_dof" else HUGE if path.stem in GIVEN else LARGEST_NUMBER
-    right = np.abs(values) <= largest  # false of NaN
-    if not right.all():
-        row = int(np.argmin(right))
+    is_allowed = np.abs(values) <= largest  # false of NaN
+    if not is_allowed.all():
+        row = int(np.argmin(is_allowed))
         value, what = one_line(column.iloc[row], 60), "too large a" if np.isfinite(values[row]) else "not a finite"
         raise InputError(f"{path}: column '{column.name}', row {first + row}: {what} number ({value})")
     if column.name in SQUARES and (values < 0).any():

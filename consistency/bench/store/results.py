@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from consistency.bench.scenario import Scenario, explain
 from consistency.bench.store.folder_tables import require_unchanged, write_tables
 from consistency.bench.store.parquet import OPTIONAL, Columns, read_batches, read_parquet, require_table
-from consistency.bench.store.results_check import require_manifest, require_rows
+from consistency.bench.store.results_folder_faults import require_manifest, require_rows
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
@@ -91,9 +91,9 @@ class Tables(ABC):
 
     def _repr_html_(self) -> str:
         """Summary of the results for a notebook; ``consistency.analyse`` judges them."""
-        world = self.manifest.get("scenario") or {}
-        title = f"Results of {world.get('name') or self.manifest.get('log') or 'runs'}"
-        rows = "".join(
+        scenario_entry = self.manifest.get("scenario") or {}
+        title = f"Results of {scenario_entry.get('name') or self.manifest.get('log') or 'runs'}"
+        table_rows = "".join(
             f"<tr><th style='text-align:left'>{escape(name)}</th><td>{len(self.runs_of(name))}</td>"
             f"<td>{int((self.failures['filter'] == name).sum())}</td></tr>"
             for name in self.filters
@@ -101,7 +101,7 @@ class Tables(ABC):
         truth = "with truth" if self.has_truth else "without truth"
         return (
             f"<div><p><strong>{escape(str(title))}</strong>, {truth}, seed {escape(str(self.manifest.get('seed')))}</p>"
-            f"<table><tr><th>filter</th><th>runs</th><th>failed</th></tr>{rows}</table></div>"
+            f"<table><tr><th>filter</th><th>runs</th><th>failed</th></tr>{table_rows}</table></div>"
         )
 
     def finished_runs(self, filters: Sequence[str]) -> set[int]:
@@ -111,9 +111,9 @@ class Tables(ABC):
 
     def runs_of(self, filter_name: str) -> Indices:
         """Numbers of the runs of one filter, failed ones too, sorted."""
-        parts = [np.unique(batch["run"]) for batch in self.batches("estimates", ["run"], filter_name)]
-        parts.append(self.failures.loc[self.failures["filter"] == filter_name, "run"].to_numpy())
-        return np.unique(np.concatenate(parts)).astype(np.int64)
+        run_numbers = [np.unique(batch["run"]) for batch in self.batches("estimates", ["run"], filter_name)]
+        run_numbers.append(self.failures.loc[self.failures["filter"] == filter_name, "run"].to_numpy())
+        return np.unique(np.concatenate(run_numbers)).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,9 @@ def joined(parts: Sequence[Results]) -> Results:
     manifest |= {"error": errors} if errors else {}
     tables: dict[str, Any] = {}
     for name in ("estimates", "failures", "map", "rejections"):
-        all_ = (getattr(part, name) for part in parts)
-        those = [table for table in all_ if table is not None and (name != "failures" or len(table))]
-        tables[name] = pd.concat(those, ignore_index=True) if those else getattr(parts[0], name)
+        tables_of_parts = (getattr(part, name) for part in parts)
+        tables_there = [table for table in tables_of_parts if table is not None and (name != "failures" or len(table))]
+        tables[name] = pd.concat(tables_there, ignore_index=True) if tables_there else getattr(parts[0], name)
     return replace(parts[0], manifest=manifest, **tables)
 
 
@@ -219,12 +219,12 @@ def open_results(folder: str | Path) -> StoredResults:
     folder = Path(folder)
     manifest = read_manifest(folder)
     require_manifest(folder, manifest)
-    written = manifest["tables"]
-    for name in ("estimates", *(name for name in ("truth", "map") if name in written)):
+    tables_written = manifest["tables"]
+    for name in ("estimates", *(name for name in ("truth", "map") if name in tables_written)):
         require_table(folder, name)
     require_unchanged(folder, manifest)
-    landmarks = read_parquet(folder, "landmarks") if "landmarks" in written else None
-    rejections = read_parquet(folder, "rejections") if "rejections" in written else None
+    landmarks = read_parquet(folder, "landmarks") if "landmarks" in tables_written else None
+    rejections = read_parquet(folder, "rejections") if "rejections" in tables_written else None
     results = StoredResults(folder, read_parquet(folder, "failures"), landmarks, manifest, rejections)
     if OWN_NUMBERS in map(results.numbers_of, results.filters):
         require_table(folder, "estimates", OWN_NUMBERS)

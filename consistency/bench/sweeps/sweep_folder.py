@@ -14,9 +14,8 @@ from typing import Any
 from consistency.bench.scenario import Scenario
 from consistency.bench.store.folder_tables import write_tables
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.sweeps.axes import Axis
-from consistency.bench.sweeps.cell import CellOutcome, CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.plan import MOST_CELLS, Cell, StoppingRule, Sweep, alone, number_of_points
+from consistency.bench.sweeps.run_cell import CellOutcome, CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.sweep_file import Cell, Sweep, SweepFile, sweep_of
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
 from consistency.referee.system.atomic import write_whole
@@ -28,7 +27,7 @@ CELLS = "cells"  # folder of the cells in that of the sweep
 # rooms whose code the numbers of a cell depend on
 CODE = (
     "referee/diagnostics", "referee/geometry", "referee/verdicts", "bench/filters", "bench/models",
-    "bench/runs/sequential.py", "bench/scenario", "bench/simulation", "bench/store",
+    "bench/runs/run_outcome.py", "bench/runs/run_until_decided.py", "bench/scenario", "bench/simulation", "bench/store",
 )  # fmt: skip
 
 
@@ -95,14 +94,14 @@ class SweepFolder:
 
     def changed_input(self, work: CellWork) -> str:
         """What the result that is there was made with and what differs now, in words; empty where all is the same."""
-        path = self.place(work)
-        before = read_manifest(path).get("inputs")
-        if not isinstance(before, dict):
-            raise InputError(f"{path}/manifest.json: key 'inputs' is missing; remove that folder")
+        cell_folder = self.place(work)
+        inputs_before = read_manifest(cell_folder).get("inputs")
+        if not isinstance(inputs_before, dict):
+            raise InputError(f"{cell_folder}/manifest.json: key 'inputs' is missing; remove that folder")
         for key, value in self.inputs(work).items():
-            if before.get(key) != value:
-                what = "source code of the bench" if key == "code" else key
-                return f"{path}: made with another {what} ({before.get(key)}, now {value})"
+            if inputs_before.get(key) != value:
+                input_name = "source code of the bench" if key == "code" else key
+                return f"{cell_folder}: made with another {input_name} ({inputs_before.get(key)}, now {value})"
         return ""
 
     def require_usable(self, overwrite: bool) -> None:
@@ -117,12 +116,12 @@ class SweepFolder:
             raise InputError(f"--out {self.path}: holds {kind}, not a sweep; choose another folder")
         if overwrite:
             return
-        there = [work for work in self.all_work() if self.place(work).exists()]
-        changed = [text for work in there if (text := self.changed_input(work))]
-        if changed:
-            more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
+        finished_cells = [work for work in self.all_work() if self.place(work).exists()]
+        changed_cells = [text for work in finished_cells if (text := self.changed_input(work))]
+        if changed_cells:
+            more = f" (and {len(changed_cells) - 1} more)" if len(changed_cells) > 1 else ""
             raise InputError(
-                f"{changed[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
+                f"{changed_cells[0]}{more}; add --overwrite to run such cells again, or give another --out to keep them"
             )
 
     def all_work(self) -> list[CellWork]:
@@ -130,8 +129,8 @@ class SweepFolder:
 
         Slow cells lie together in the grid; mixed, the time left is foreseen.
         """
-        mixed = sorted(self.sweep.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
-        return [CellWork(cell, name) for cell in mixed for name in self.sweep.filters]
+        cells_in_mixed_order = sorted(self.sweep.cells, key=lambda cell: hashlib.sha256(cell.name.encode()).digest())
+        return [CellWork(cell, name) for cell in cells_in_mixed_order for name in self.sweep.filters]
 
     def begin(self) -> None:
         """Make the folder, or take over the one that is there; other processes may do so at the same time."""
@@ -143,13 +142,13 @@ class SweepFolder:
             except InputError:
                 if not self.path.exists():
                     raise
-        before = read_manifest(self.path)
+        manifest_before = read_manifest(self.path)
         try:
-            former = sweep_from(before, self.path)
+            sweep_before = sweep_from(manifest_before, self.path)
         except InputError:
-            former = self.sweep
-        if replace(former, filters=()) == replace(self.sweep, filters=()):
-            self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*former.filters, *self.sweep.filters))))
+            sweep_before = self.sweep
+        if replace(sweep_before, filters=()) == replace(self.sweep, filters=()):
+            self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*sweep_before.filters, *self.sweep.filters))))
         text = json.dumps(manifest | {"sweep": describe(self.sweep), "tables": []}, indent=2)
         write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
 
@@ -185,24 +184,24 @@ class SweepFolder:
 
     def results(self) -> dict[tuple[int, str], CellResult]:
         """What is there, by number of the cell and filter; results with other inputs are left out."""
-        found: dict[tuple[int, str], CellResult] = {}
+        cell_results: dict[tuple[int, str], CellResult] = {}
         for cell in self.sweep.cells:
             for name in self.sweep.filters:
                 result = self.result(CellWork(cell, name))
                 if result is not None:
-                    found[cell.number, name] = result
-        return found
+                    cell_results[cell.number, name] = result
+        return cell_results
 
 
 def describe(sweep: Sweep) -> dict[str, Any]:
     """A sweep as JSON, from which it can be made again."""
-    varied = {axis.key: list(axis.values) for axis in sweep.alone}
+    values_alone = {axis.key: list(axis.values) for axis in sweep.alone}
     return {
         "name": sweep.name,
         "summary": sweep.summary,
         "base": sweep.base.model_dump(mode="json"),
         "grid": {axis.key: list(axis.values) for axis in sweep.grid},
-        **({"alone": varied} if varied else {}),
+        **({"alone": values_alone} if values_alone else {}),
         "filters": list(sweep.filters),
         "seed": sweep.seed,
         "rule": sweep.rule.model_dump(),
@@ -218,26 +217,15 @@ def sweep_from(manifest: dict[str, Any], path: Path) -> Sweep:
         It is damaged.
     """
     with reading(path, "key 'sweep' is damaged; write it again"):
-        data = manifest["sweep"]
-        base = Scenario.model_validate(data["base"])
-        axes = [Axis(key, _listed(values)) for key, values in data["grid"].items()]
-        axes += [alone(Axis(key, _listed(values)), base) for key, values in data.get("alone", {}).items()]
-        filters = _listed(data["filters"])
-        if not all(isinstance(name, str) for name in filters):
-            raise ValueError("filters must be names")
-        if number_of_points(axes) > MOST_CELLS:
-            raise ValueError(f"more than {MOST_CELLS} cells")
-        rule = StoppingRule.model_validate(data["rule"])
-        name, summary, seed = str(data["name"]), str(data["summary"]), int(data["seed"])
-        sweep = Sweep(name, summary, base, tuple(axes), filters, seed, rule)
+        content = dict(manifest["sweep"])
+        name, base = str(content.pop("name")), Scenario.model_validate(content.pop("base"))
+        file = SweepFile.model_validate(content | {"base": base.name})
+        try:
+            sweep = sweep_of(name, file, base)
+        except InputError as error:
+            raise ValueError(str(error)) from None
         _ = sweep.cells  # each is checked when it is made
         return sweep
-
-
-def _listed(values: Any) -> tuple[Any, ...]:
-    if not isinstance(values, list) or not values:
-        raise ValueError("filters and values must be lists")
-    return tuple(values)
 
 
 def open_sweep(path: Path) -> SweepFolder:

@@ -29,7 +29,7 @@ class NoiseGroup(NamedTuple):
     channels: tuple[str, ...]
 
 
-def groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
+def noise_groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
     """Groups as the option ``--groups`` has them: "Q,R", "Q.v,Q.omega,R" or "Q,R.u+R.v,R.d".
 
     ``Q`` and ``R`` stand for all their channels with a noise. Channels that no group names stay as they are.
@@ -39,23 +39,23 @@ def groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
     InputError
         An unknown channel, one that is named twice, or one whose noise is zero and stays so whatever its factor.
     """
-    sigma, known = sigma_by_channel(belief), dict[str, list[str]]()
+    sigma, channels_by_name = sigma_by_channel(belief), dict[str, list[str]]()
     for noise in ("Q", "R"):
         members = [channel for channel in sigma if channel.startswith(noise)]
-        known[noise] = [channel for channel in members if sigma[channel] > 0.0]
-        known |= {channel: [channel] for channel in members}
+        channels_by_name[noise] = [channel for channel in members if sigma[channel] > 0.0]
+        channels_by_name |= {channel: [channel] for channel in members}
     groups, seen = [], set[str]()
     for name in (part.strip() for part in text.split(",")):
         channels: list[str] = []
         for member in (part.strip() for part in name.split("+")):
-            if member not in known:
-                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {', '.join(known)}")
-            if not any(sigma[channel] for channel in known[member]):
+            if member not in channels_by_name:
+                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {', '.join(channels_by_name)}")
+            if not any(sigma[channel] for channel in channels_by_name[member]):
                 raise InputError(
                     f"--groups {text}: '{member}' is believed to be zero, which no factor changes; believe in a noise, "
                     "or leave it out"
                 )
-            channels += known[member]
+            channels += channels_by_name[member]
         for channel in channels:
             if channel in seen:
                 raise InputError(f"--groups {text}: '{channel}' is named twice; it has one factor")
@@ -89,8 +89,8 @@ def sigma_by_channel(belief: Belief) -> dict[str, float]:
 
 
 def _with_sigma(belief: Belief, sigma: dict[str, float]) -> Belief:
-    v, omega, *rest = sigma.values()
-    motion = belief.motion.model_copy(update={"sigma_v": v, "sigma_omega": omega})
+    sigma_v, sigma_omega, *sensor_sigmas = sigma.values()
+    motion = belief.motion.model_copy(update={"sigma_v": sigma_v, "sigma_omega": sigma_omega})
     return belief.model_copy(
-        update={"motion": motion, "sensor": belief.sensor.model_copy(update={"sigma": tuple(rest)})}
+        update={"motion": motion, "sensor": belief.sensor.model_copy(update={"sigma": tuple(sensor_sigmas)})}
     )

@@ -10,17 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.stepping import name_of
+from consistency.bench.filters.filter_declarations import name_of, resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.montecarlo import resolve_filters
 from consistency.bench.scenario import Belief, Scenario, load_scenario
-from consistency.bench.store.log import Log
-from consistency.bench.tuning.fit import FactorFit, maximise
-from consistency.bench.tuning.noise_groups import NoiseGroup, groups_of, rounded, scaled
-from consistency.bench.tuning.result import Factor, Setting, Tuning
-from consistency.bench.tuning.scores import BeliefScorer, require_scorable
-from consistency.bench.tuning.split import parts_of
+from consistency.bench.store.recorded_log import Log
+from consistency.bench.tuning.fit_and_verdict_trials import parts_of
+from consistency.bench.tuning.innovation_likelihood import BeliefScorer, require_scorable
+from consistency.bench.tuning.noise_factor_fit import FactorFit, fit_log_factors
+from consistency.bench.tuning.noise_groups import NoiseGroup, noise_groups_of, rounded, scaled
+from consistency.bench.tuning.tuning_result import Factor, Setting, Tuning
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
@@ -67,7 +66,7 @@ def tune(
     world = load_scenario(world) if isinstance(world, str | Path) else world
     instance = get_filter(filter_) if isinstance(filter_, str) else filter_
     resolve_filters([instance], world.belief, world.name if isinstance(world, Log) else None)
-    noise_groups = groups_of(groups, world.belief)
+    noise_groups = noise_groups_of(groups, world.belief)
     parts = parts_of(world, runs, seed)
     require_scorable(instance)
     settings = settings or Settings()
@@ -106,7 +105,7 @@ def fitted(scorer: BeliefScorer, belief: Belief, groups: Sequence[NoiseGroup], w
         scores = scorer(scaled(belief, groups, log_factors))
         return None if scores.failures else scores.log_density
 
-    fit = maximise(score, [np.full(len(groups), np.log(factor)) for factor in starts])
+    fit = fit_log_factors(score, [np.full(len(groups), np.log(factor)) for factor in starts])
     if fit is None:
         count, first = len(at_first.failures), at_first.failures[0]
         raise InputError(

@@ -6,44 +6,37 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import inverse, log, matrices
-from consistency.referee.readers.clock_offset import MOST, REACH
-from consistency.referee.readers.truth_matching import Poses, truth_at
+from consistency.referee.geometry.lie_groups import inverse, log, matrices
+from consistency.referee.readers.clock_offset import GRID, MOST, REACH, refined
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 LONG = 1.0  # s, of the motions that are compared
 KEPT = 0.9  # of the squared errors, the smallest: jumps decide nothing
 PARTS = 5  # drives that show how well the offset is known; fewer ones are cut into as many parts
 UNSURE = 0.1  # s, standard error of an offset that is not used
-STEPS = np.geomspace(0.004, REACH, 12)
-GRID = np.concatenate([-STEPS[::-1], [0.0], STEPS])
 
 
 class TimedMotions(NamedTuple):
     """Some motions of a drive, K of them."""
 
-    poses: Poses
-    starts: Array  # (K,), s
-    ends: Array  # (K,), s
+    starts: Poses
+    ends: Poses
     motions: Array  # (K, d + 1, d + 1), estimated
 
     def squares(self, shift: float) -> Array:
         """Squared errors (k, 2) of positions and rotations, with the truth ``shift`` s later, where it is known."""
-        p = self.poses
         true = np.full((2, *self.motions.shape), np.nan)
-        for T, times in zip(true, (self.starts, self.ends), strict=True):
-            known = truth_at(times + shift, p.true_t, p.truth, p.manifold, p.max_dt)
+        for T, poses in zip(true, (self.starts, self.ends), strict=True):
+            known = poses.known(shift)
             T[known.rows] = matrices(known.truth)
-        start, end = true
         is_known = np.isfinite(true).all(axis=(0, 2, 3))
-        error = log(inverse(self.motions[is_known]) @ inverse(start[is_known]) @ end[is_known])
+        start, end = true[:, is_known]
+        error = log(inverse(self.motions[is_known]) @ inverse(start) @ end)
         d = self.motions.shape[-1] - 1
-        positions = (error[:, :d] ** 2).sum(axis=1)
-        rotations = (error[:, d:] ** 2).sum(axis=1)
-        return np.column_stack([positions, rotations])
+        return np.column_stack([np.square(error[:, :d]).sum(axis=1), np.square(error[:, d:]).sum(axis=1)])
 
 
 def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
@@ -69,8 +62,7 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
         for rows in np.array_split(some, -(-PARTS // len(drives))):
             if len(rows):
                 ends = last[rows]
-                motions = inverse(T[rows]) @ T[ends]
-                parts.append(TimedMotions(poses, poses.t[rows], poses.t[ends], motions))
+                parts.append(TimedMotions(poses.of_rows(rows), poses.of_rows(ends), inverse(T[rows]) @ T[ends]))
     if len(parts) > 1:
         offset = _best(parts)
         spread = float(np.std([_best([part]) for part in parts], ddof=1))
@@ -97,6 +89,4 @@ def _best(parts: Sequence[TimedMotions]) -> float:
     is_told = np.nanmax(sizes) - sizes[best] > 1e-6
     if best in (0, len(GRID) - 1) or not is_told:
         return float("nan")
-    bounds = GRID[best - 1], GRID[best + 1]
-    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": 1e-4})
-    return float(found.x if found.fun < sizes[best] else GRID[best])
+    return refined(size, sizes, 1e-4)

@@ -20,12 +20,11 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
-from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of
-from consistency.referee.fit_covariance.floors import fit_runs
+from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, fit_runs
 from consistency.referee.fit_covariance.intervals import mean_over_runs
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 LEVELS = (0.68, 0.95, 0.99)
 ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
@@ -52,9 +51,8 @@ class HeldOut:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
         nees = self.record.nees
         assert nees is not None
-        counted = np.isfinite(nees)
         bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
-        return np.array([average(np.where(counted, nees <= bound, np.nan)) for bound in bounds])
+        return np.array([average(np.where(np.isfinite(nees), nees <= bound, np.nan)) for bound in bounds])
 
 
 @dataclass(frozen=True)
@@ -204,16 +202,13 @@ def the_record(records: Sequence[Record], name: str | None = None) -> Record:
     InputError
         There are several, or none of this name.
     """
-    named_so = [record for record in records if name in (None, record.name)]
-    if len(named_so) == 1:
-        return named_so[0]
-    there = ", ".join(record.name for record in records)
-    what = (
-        f"--filter {name}: is not in these files"
-        if name
-        else "these files hold several estimators: name one by --filter"
-    )
-    raise InputError(f"{what}; there are: {there}")
+    found = [record for record in records if name in (None, record.name)]
+    if len(found) == 1:
+        return found[0]
+    what = "these files hold several estimators: name one by --filter"
+    if name is not None:
+        what = f"--filter {name}: is not in these files"
+    raise InputError(f"{what}; there are: {', '.join(record.name for record in records)}")
 
 
 def require_runs(record: Record) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
@@ -40,13 +40,14 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
 
     Returns the names of what ``analyse`` reads: a file, or a folder of trajectories.
     """
-    numbers = dict(zip(found.runs, record.run_numbers.tolist(), strict=True))
-    held_out = {numbers[name]: factors for name, factors in zip(found.judged, found.used, strict=True)}
+    held_out = dict(zip(found.before.record.run_numbers.tolist(), found.used, strict=True))
     groups = record.groups
     is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
     are_runs = record.unit == "run"  # pieces of one log are not in its file
-    runs = numbers.values() if are_runs else [file.run for file in files]
-    corrected = dict.fromkeys(runs if is_text else numbers.values(), by_group(found.fits))
+    runs = record.run_numbers.tolist()
+    if is_text and not are_runs:
+        runs = [file.run for file in files]
+    corrected = dict.fromkeys(runs, by_group(found.fits))
     return [
         _write_one(folder / HELD_OUT, found, record, files if is_text and are_runs else (), held_out),
         _write_one(folder / CORRECTED, found, record, files if is_text else (), corrected),
@@ -75,8 +76,7 @@ def _change(
     """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out."""
     if run not in of_runs:
         return None
-    factor, floor = of_runs[run][place_in(groups, value)].of_components()
-    return dict(zip(axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
+    return of_runs[run][place_in(groups, value)].by_name(axes)
 
 
 def place_in(groups: Groups | None, value: str) -> int:
@@ -167,9 +167,5 @@ def gtsam_noise(P{value}):
 
 def _table_of_factors(found: Correction) -> str:
     """Lines of the table of factors and floors by group and component."""
-    lines = []
-    for group, fit in found.shown.items():
-        factor, floor = fit.factors.of_components()
-        numbers = dict(zip(found.axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
-        lines.append(f"    {group!r}: {numbers},\n")
+    lines = [f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items()]
     return "".join(lines)

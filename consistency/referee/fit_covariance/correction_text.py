@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import plural, short
-from consistency.referee.document.blocks import Block, Cell, Column, Document, Table, Text, table
+from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.fit_covariance.correct import FEW, LEVELS, Correction, HeldOut
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, shown
 
@@ -45,25 +46,20 @@ def correction_document(found: Correction) -> Document:
 
 
 def _factors(found: Correction) -> Table:
+    """A row for each block, in each group; columns of groups and floors where there are some."""
     fits = found.shown
-    columns = [Column("block"), Column("components"), Column("factor on variances"), Column("on sigmas", number=True)]
-    has_groups = len(found.fits) > 1
     has_floors = any(each.high > 0.0 for fit in fits.values() for each in fit.floor)
-    if has_groups:
-        columns.insert(0, Column("group"))
-    if has_floors:
-        columns.append(Column("floor, as a sigma"))
+    is_shown = (len(found.fits) > 1, True, True, True, True, has_floors)
+    factor_heads = Column("factor on variances"), Column("on sigmas", number=True)
+    columns = (Column("group"), Column("block"), Column("components"), *factor_heads, Column("floor, as a sigma"))
     rows = []
     for group, fit in fits.items():
         for block, factor, floor in zip(found.blocks, fit.factor, fit.floor, strict=True):
             names = " ".join(found.axes[i] for i in block.places)
-            row: list[Cell] = [block.name, names, shown(factor), f"x{short(float(np.sqrt(factor.value)))}"]
-            if has_groups:
-                row.insert(0, group)
-            if has_floors:
-                row.append(_sigma(floor, block.name))
-            rows.append(tuple(row))
-    return table(tuple(columns), rows, "Factors of each block", style="plain")
+            on_sigmas = f"x{short(float(np.sqrt(factor.value)))}"
+            row = (group, block.name, names, shown(factor), on_sigmas, _sigma(floor, block.name))
+            rows.append(tuple(compress(row, is_shown)))
+    return table(tuple(compress(columns, is_shown)), rows, "Factors of each block", style="plain")
 
 
 def _sigma(floor: Interval, block: str) -> str:
@@ -147,7 +143,6 @@ def _block(found: Correction, group: str, b: int) -> dict[str, Any]:
 
 
 def _held_out(one: HeldOut) -> dict[str, Any]:
-    coverage = {
-        f"inside_{level:.0%}".rstrip("%"): share for level, share in zip(LEVELS, one.covered(LEVELS), strict=True)
-    }
+    names = (f"inside_{100 * level:.0f}" for level in LEVELS)
+    coverage = dict(zip(names, one.covered(LEVELS), strict=True))
     return {"ratio": one.ratio.value, "ratio_interval": one.ratio[1:], **coverage, "log_score": one.scores.mean()}

@@ -21,6 +21,7 @@ from consistency.referee.types import Array, Indices
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH
 HALF = "half"
 IN_TURN = "in turn"
+NEVER = np.iinfo(np.int64).max  # no row
 
 
 @dataclass(frozen=True)
@@ -28,13 +29,16 @@ class Fold:
     """A fit to some drives or first halves, and what it is judged by."""
 
     noise: WhiteNoise
-    judged: Indices  # drives
-    since: Array  # (drives,), row from which a window may be judged; 0 where the whole drive is
+    since: Indices  # (drives,), row from which windows are judged, NEVER in drives that are fitted alone
+
+    @property
+    def judged(self) -> Indices:
+        """Drives with windows that are judged."""
+        return np.flatnonzero(self.since < NEVER)
 
     def judges(self, windows: DriveWindows) -> Array:
         """Which windows chose nothing of this fit, (W,)."""
-        is_late = windows.first >= self.since[windows.drive]
-        return np.asarray(np.isin(windows.drive, self.judged) & is_late)
+        return np.asarray(windows.first >= self.since[windows.drive])
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,6 @@ class JudgedSpan:
         return "undecided" if "undecided" in found else "consistent"
 
 
-def are_halves(windows: DriveWindows, held_out: str | None) -> bool:
-    """Whether second halves of drives are judged by a fit to the first ones."""
-    return held_out == HALF or (held_out is None and len(windows.drives) == 1)
-
-
 def folds_of(
     windows: DriveWindows,
     held_out: str | None,
@@ -110,21 +109,20 @@ def folds_of(
         A name is not a drive, or nothing is left to fit or to judge.
     """
     every = np.arange(len(windows.drives))
-    begin = np.zeros(len(every), np.int64)
-    if are_halves(windows, held_out):
-        middle = np.array([_middle(windows.last[windows.drive == i]) for i in every])
-        early = windows.of(windows.last <= middle[windows.drive])
-        return fit(windows), [Fold(fit(early), every, middle)]
-    if held_out is None:
-        judged = np.unique(windows.drive)[:, None]
-        folds = [Fold(fit(windows.of(windows.drive != i)), i, begin) for i in judged]
+    if held_out == HALF:
+        since = [np.array([_middle(windows.last[windows.drive == i]) for i in every])]
+    elif held_out is None:
+        since = [np.where(every == i, 0, NEVER) for i in np.unique(windows.drive)]
+    else:
+        judged = named([drive.name for drive in windows.drives], held_out)
+        is_judged = np.isin(windows.drive, judged)
+        if is_judged.all() or not is_judged.any():
+            raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
+        since = [np.where(np.isin(every, judged), 0, NEVER)]
+    folds = [Fold(fit(windows.of(windows.last <= each[windows.drive])), each) for each in since]
+    if held_out in (None, HALF):
         return fit(windows), folds
-    judged = named([drive.name for drive in windows.drives], held_out)
-    is_judged = np.isin(windows.drive, judged)
-    if is_judged.all() or not is_judged.any():
-        raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
-    noise = fit(windows.of(~is_judged))
-    return noise, [Fold(noise, judged, begin)]
+    return folds[0].noise, folds
 
 
 def _middle(ends: Indices) -> int:
@@ -183,26 +181,22 @@ def ratio_of(
     A single drive has an interval from the means of consecutive windows, of ``values`` (W,), which holds for it alone.
     """
     known = np.isfinite(by_drive) & (by_drive > 0)
-    drives = int(known.sum())
-    spread = reach = float("nan")
-    center = float("nan")
-    if drives > 1:
-        logs = np.log(by_drive[known])
+    ratios = by_drive[known]
+    center = spread = reach = float("nan")
+    if len(ratios) > 1:
+        logs = np.log(ratios)
         if dof is not None:
             half = 0.5 * dof[known]
             logs += np.log(half) - special.digamma(half)
         center, _, high = mean_over_runs(logs)
         spread, reach = float(logs.std(ddof=1)), high - center
-    elif drives == 1:
-        mean = float(values.mean())
-        parts = np.array_split(values, min(BLOCKS, len(values)))
-        middle, _, high = mean_over_runs(np.array([part.mean() for part in parts]))
-        center, reach = np.log(mean), (high - middle) / middle
-        if len(parts) == 1:
-            reach = np.inf
-    low = float(np.exp(center - reach))
-    high = float(np.exp(np.minimum(center + reach, 700.0)))
-    return Ratio(float(np.exp(center)), low, high, spread, drives, len(values), general)
+    elif len(ratios) == 1:
+        parts = [part.mean() for part in np.array_split(values, min(BLOCKS, len(values)))]
+        middle, _, high = mean_over_runs(np.array(parts))
+        center = float(np.log(values.mean()))
+        reach = (high - middle) / middle if len(parts) > 1 else np.inf
+    value, low, high = np.exp(np.minimum([center, center - reach, center + reach], 700.0)).tolist()
+    return Ratio(value, low, high, spread, len(ratios), len(values), general)
 
 
 def shown(ratio: Ratio | Interval) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.clocks import clock_offset
-from consistency.referee.geometry.groups import composed, matrices
+from consistency.referee.geometry.lie_groups import composed, matrices
 from consistency.referee.readers.declared_axes import in_axes_of_estimates
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
@@ -27,7 +27,7 @@ from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import Found, kind_of
 from consistency.referee.readers.places import refuse
-from consistency.referee.readers.truth_matching import Estimator, Poses, truth_at
+from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array, Indices
 
 
@@ -165,7 +165,7 @@ def _matrices(poses: Poses, r: Reading) -> Array:
 
 def _drive(poses: Poses, T: Array, shift: float) -> Drive:
     t = poses.t + shift
-    known = truth_at(t, poses.true_t, poses.truth, poses.manifold, poses.max_dt)
+    known = poses.known(shift)
     if len(known.rows) < 2:
         raise InputError(
             f"{poses.name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t "

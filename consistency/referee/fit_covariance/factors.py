@@ -7,15 +7,22 @@ run counts by the mean over its steps, so that nothing is assumed about how its 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.intervals import chance_of_one, dof_of_ratio, interval_of_ratio
-from consistency.referee.types import Array
+from consistency.referee.fit_covariance.intervals import (
+    chance_of_one,
+    dof_of_ratio,
+    floor_interval,
+    interval_of_ratio,
+    mean_over_runs,
+)
+from consistency.referee.fit_covariance.likelihood import Score, log_densities, maximise, nonnegative, score_of
+from consistency.referee.types import Array, Indices
 
 KINDS = {
     "position": ("x", "y", "z", "east", "north", "up", "e", "n", "u"),
@@ -26,6 +33,11 @@ KINDS = {
 }
 ROUNDS = 50  # of Newton's method
 FAR, CLOSE = 0.25, 1e-10  # decrement from which its steps are damped, and at which it ends
+ALIKE = 0.98  # squared cosine between a stated covariance and a floor, from which data do not tell one from the other
+GAIN = 1e-9  # of the log likelihood of a step at which scoring ends
+LEAST = 1e-9  # of its value with no floor, that a factor has
+NONE = Interval(0.0, 0.0, 0.0)
+SAME = "the stated covariance hardly varies, or has the shape of a floor, so that factor and floor cannot be told apart"
 
 
 @dataclass(frozen=True)
@@ -57,11 +69,29 @@ class Factors:
         shares = members(self.blocks)
         return self.factor @ shares, self.floor @ shares
 
+    def by_name(self, axes: Sequence[str]) -> dict[str, tuple[float, float]]:
+        """Factor and floor of each component by its name."""
+        factor, floor = self.of_components()
+        return dict(zip(axes, zip(factor.tolist(), floor.tolist(), strict=True), strict=True))
+
     def applied(self, P: Array) -> Array:
         """Corrected covariances of stated ones, (..., n, n)."""
         factor, floor = self.of_components()
         d = np.sqrt(factor)
         return np.asarray(P * np.outer(d, d) + np.diag(floor))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Factors of some runs, and what becomes of them with each of R runs left out."""
+
+    factors: Factors
+    left_out: tuple[Factors, ...]  # (R,), each fitted without one run
+    factor: tuple[Interval, ...]  # (B,), before any term was dropped
+    floor: tuple[Interval, ...]  # (B,)
+    dof: Array  # (B,), degrees of freedom with which a factor is known
+    chance: tuple[float, ...]  # (B,), of a factor as far from 1, without floors, where the right one is 1
+    notes: tuple[str, ...] = ()
 
 
 def members(blocks: Sequence[Block]) -> Array:
@@ -90,22 +120,6 @@ def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
     return tuple(Block(name, tuple(places)) for name, places in found.items())
 
 
-# --- the factors alone ------------------------------------------------------------------------------------------------
-
-
-def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
-    """Q (R, B, B): means over the steps of each run of e_b' (P^-1)_bc e_c, which is all that factors are fitted to.
-
-    NaN where a run has no step that counts.
-    """
-    Q = np.full((len(record.run_numbers), len(blocks), len(blocks)), np.nan)
-    for run, (error, P) in enumerate(steps_of_runs(record)):
-        if len(error):
-            parts = error[..., None] * members(blocks).T
-            Q[run] = np.mean(np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts), axis=0)
-    return Q
-
-
 def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
     """Errors (k, n) and stated covariances (k, n, n) of the steps of each run that count."""
     assert record.error is not None
@@ -114,6 +128,72 @@ def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
     for error, P, nees in zip(record.error, record.covariance, record.nees, strict=True):
         there = np.isfinite(nees)
         yield error[there], P[there]
+
+
+def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
+    """Fit a factor to each block of two runs or more, and a floor where the held-out log score of runs asks for it.
+
+    Each run has a step that counts. Where factor and floor can be told apart, the intervals are those of the model with
+    both.
+    """
+    alone = fit_alone(record, blocks)
+    free, notes = [], []
+    for b, block in enumerate(blocks):
+        if likeness(record, block) < ALIKE:
+            free.append(b)
+        else:
+            notes.append(f"{block.name}: {SAME}: the floor is 0")
+    if not free:
+        return replace(alone, notes=tuple(notes))
+    both = fit_with_floors(record, alone, np.array(free))
+    gain = mean_over_runs(held_out_scores(record, both) - held_out_scores(record, alone))
+    if gain.low > 0.0:
+        notes.append(
+            f"with floors the held-out log score of a step gains {gain.value:.2g} [{gain.low:.2g}, {gain.high:.2g}]"
+        )
+        return replace(both, notes=tuple(notes))
+    notes.append(f"floors are 0: with them the held-out log score of a step is not shown to gain ({gain.value:+.2g})")
+    factors = zip(alone.factor, both.factor, strict=True)
+    intervals = (Interval(a.value, min(a.value, b.low), max(a.value, b.high)) for a, b in factors)
+    floors = (each._replace(value=0.0, low=0.0) for each in both.floor)
+    return replace(alone, factor=tuple(intervals), floor=tuple(floors), notes=tuple(notes))
+
+
+def held_out_scores(record: Record, fit: Fit) -> Array:
+    """Log density of a step of each run by the fit of the others, (R,)."""
+    runs = zip(fit.left_out, steps_of_runs(record), strict=True)
+    return np.array([log_densities(error, factors.applied(P)).mean() for factors, (error, P) in runs])
+
+
+# --- factors alone ----------------------------------------------------------------------------------------------------
+
+
+def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
+    """Fit a factor to each block of the errors of two runs or more, without floors."""
+    sizes = np.array([len(block) for block in blocks], float)
+    Q = run_moments(record, blocks)
+    factor = fit_factors(Q.mean(axis=0), sizes)
+    left_out = fit_factors((Q.sum(axis=0) - Q) / (len(Q) - 1), sizes)
+    none = np.zeros(len(blocks))
+    values = list(zip(factor.tolist(), left_out.T, strict=True))
+    return Fit(
+        Factors(blocks, factor, none),
+        tuple(Factors(blocks, each, none) for each in left_out),
+        tuple(interval_of_ratio(*value) for value in values),
+        (NONE,) * len(blocks),
+        known_dof(left_out, sizes),
+        tuple(chance_of_one(*value) for value in values),
+    )
+
+
+def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
+    """Q (R, B, B): means over the steps of each run of e_b' (P^-1)_bc e_c, which is all that factors are fitted to."""
+    Q = []
+    for error, P in steps_of_runs(record):
+        parts = error[..., None] * members(blocks).T
+        products = np.swapaxes(parts, 1, 2) @ np.linalg.solve(P, parts)
+        Q.append(products.mean(axis=0))
+    return np.array(Q)
 
 
 def fit_factors(Q: Array, sizes: Array) -> Array:
@@ -142,42 +222,6 @@ def fit_factors(Q: Array, sizes: Array) -> Array:
     return np.asarray(x**-2.0)
 
 
-def without_each(values: Array) -> Array:
-    """Means over the first axis with each of its R entries left out, of the same shape."""
-    return np.asarray((values.sum(axis=0) - values) / (len(values) - 1))
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Factors of some runs, and what becomes of them with each of R runs left out."""
-
-    factors: Factors
-    left_out: tuple[Factors, ...]  # (R,), each fitted without one run
-    factor: tuple[Interval, ...]  # (B,), before any term was dropped
-    floor: tuple[Interval, ...]  # (B,)
-    dof: Array  # (B,), degrees of freedom with which a factor is known
-    chance: tuple[float, ...]  # (B,), of a factor as far from 1, without floors, where the right one is 1
-    notes: tuple[str, ...] = ()
-
-
-def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
-    """Fit a factor to each block of the errors of two runs or more, without floors."""
-    sizes = np.array([len(block) for block in blocks], float)
-    Q = run_moments(record, blocks)
-    factor = fit_factors(Q.mean(axis=0), sizes)
-    left_out = fit_factors(without_each(Q), sizes)
-    none = np.zeros(len(blocks))
-    values = list(zip(factor.tolist(), left_out.T, strict=True))
-    return Fit(
-        Factors(blocks, factor, none),
-        tuple(Factors(blocks, each, none) for each in left_out),
-        tuple(interval_of_ratio(*value) for value in values),
-        (Interval(0.0, 0.0, 0.0),) * len(blocks),
-        known_dof(left_out, sizes),
-        tuple(chance_of_one(*value) for value in values),
-    )
-
-
 def known_dof(left_out: Array, sizes: Array) -> Array:
     """Degrees of freedom with which factors (R, B), each without a run, are known where R - 1 runs are fitted.
 
@@ -186,7 +230,96 @@ def known_dof(left_out: Array, sizes: Array) -> Array:
     return np.asarray(np.maximum(dof_of_ratio(left_out), (len(left_out) - 1) * sizes))
 
 
-def run_score(C: Array, error: Array) -> float:
-    """Log density of a step, mean over errors (k, n) of a run with covariances C (k, n, n)."""
-    squares = (error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1)
-    return float(-0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * C)[1]).mean())
+# --- factors and floors -----------------------------------------------------------------------------------------------
+
+
+def likeness(record: Record, block: Block) -> float:
+    """Squared cosine between the stated covariance of a block and a floor, in the metric of the likelihood.
+
+    1 where each covariance is the same multiple of the identity.
+    """
+    stated = [block.of(P) for _, P in steps_of_runs(record)]
+    squares = [np.square(np.linalg.inv(P)).sum(axis=(1, 2)).mean() for P in stated]
+    return float(len(block) * mean_precision(stated) ** 2 / np.mean(squares))
+
+
+def mean_precision(covariances: Sequence[Array]) -> float:
+    """Mean over runs, steps and components of the diagonal of P^-1, of covariances (k, n, n) of each run."""
+    return float(np.mean([np.diagonal(np.linalg.inv(P), axis1=1, axis2=2).mean() for P in covariances]))
+
+
+def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
+    """Fit factors and the floors of some blocks by scoring, beginning with the factors ``alone``.
+
+    Runs have the same weight. What is fitted without a run is one step of scoring from the fit of all.
+    """
+    blocks = alone.factors.blocks
+    B = len(blocks)
+    start = np.append(alone.factors.factor, np.zeros(len(free)))
+    least = LEAST * start
+
+    def score(theta: Array) -> Score:
+        return Score(*(part.sum(axis=0) for part in scores(record, blocks, free, theta)))
+
+    theta = maximise(score, start, least, GAIN * len(alone.left_out))
+    _, g, H = scores(record, blocks, free, theta)
+    others_g, others_H = g.sum(axis=0) - g, H.sum(axis=0) - H  # of all runs but one
+    open_value = theta + np.linalg.solve(H.sum(axis=0), g.sum(axis=0))  # which may lie below 0
+    open_left_out = theta + np.linalg.solve(others_H, others_g[..., None])[..., 0]
+    targets = zip(others_H, others_g + others_H @ theta, strict=True)
+    left_out = [with_parameters(blocks, free, np.maximum(nonnegative(*target), least)) for target in targets]
+    intervals = []
+    for i, value in enumerate(theta.tolist()):
+        inside = value if value > 2.0 * least[i] else 0.0
+        interval = floor_interval(inside, float(open_value[i]), open_left_out[:, i])
+        intervals.append(interval._replace(value=value))
+    floors = dict(zip(free.tolist(), intervals[B:], strict=True))
+    factors = with_parameters(blocks, free, theta)
+    sizes = np.array([len(block) for block in blocks], float)
+    return replace(
+        alone,
+        factors=factors,
+        left_out=tuple(left_out),
+        factor=tuple(intervals[:B]),
+        floor=tuple(floors.get(b, NONE) for b in range(B)),
+        dof=known_dof(relative_sizes(record, factors, left_out), sizes),
+    )
+
+
+def with_parameters(blocks: tuple[Block, ...], free: Indices, theta: Array) -> Factors:
+    """A factor of each block, and the floors of those that are free, from parameters (p,) in this order."""
+    floor = np.zeros(len(blocks))
+    floor[free] = theta[len(blocks) :]
+    return Factors(blocks, theta[: len(blocks)], floor)
+
+
+def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
+    """The score of a step, mean of each run: shapes (R,), (R, p) and (R, p, p)."""
+    factors = with_parameters(blocks, free, theta)
+    found = []
+    for error, P in steps_of_runs(record):
+        C = factors.applied(P)
+        of_run = score_of(error, C, derivatives(C, factors, free))
+        found.append([part / len(error) for part in of_run])
+    values, gradients, informations = map(np.array, zip(*found, strict=True))
+    return values, gradients, informations
+
+
+def derivatives(C: Array, factors: Factors, free: Indices) -> Array:
+    """Derivatives (k, p, n, n) of corrected covariances C (k, n, n) by factors and floors."""
+    n = C.shape[-1]
+    own = members(factors.blocks)
+    rates = 0.5 * own / factors.factor[:, None]  # of the square root of a factor, over it
+    scaled = C - np.diag(factors.of_components()[1])
+    by_factor = (rates[:, :, None] + rates[:, None, :]) * scaled[:, None]
+    by_floor = own[free, :, None] * np.eye(n)
+    return np.concatenate([by_factor, np.broadcast_to(by_floor, (len(C), *by_floor.shape))], axis=1)
+
+
+def relative_sizes(record: Record, whole: Factors, others: Sequence[Factors]) -> Array:
+    """Corrected variances of each block by other factors, over those by ``whole``, (others, B)."""
+    corrected = [whole.applied(P) for _, P in steps_of_runs(record)]
+    precision = np.array([mean_precision([block.of(P) for P in corrected]) for block in whole.blocks])
+    factor = np.array([each.factor for each in others]) / whole.factor
+    floor = np.array([each.floor for each in others])
+    return np.asarray(factor * (1.0 - whole.floor * precision) + floor * precision)

@@ -12,10 +12,10 @@ from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.fit_covariance.covariance_ratios import DECIDE, HALF, IN_TURN, JudgedSpan, Ratio, shown
-from consistency.referee.fit_covariance.mean_by_motion import MotionDependence
+from consistency.referee.fit_covariance.mean_differences import TERMS, MotionDependence
 from consistency.referee.fit_covariance.motion_windows import ENOUGH, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel
-from consistency.referee.fit_covariance.persistence import SHARED
+from consistency.referee.fit_covariance.second_estimator import SHARED
 from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
 
 RATIO = ("value", "low", "high", "spread", "drives", "windows", "status")  # of a ratio, as programs have it
@@ -87,11 +87,8 @@ def dependence(found: MotionDependence, is_corrected: bool) -> str:
     edges = (f"{edge:.2g} {unit}" for edge in found.edges)
     bins = [f"{value} for {motions} up to {edge}" for value, edge in zip(values, edges, strict=True)]
     offer = ""
-    if found.gain > 0 and not is_corrected:
-        offer = (
-            f"correct the way by the turn with --by-turn, which takes {found.gain:.0%} of the squared error of "
-            "positions out of motions that it is not fitted to, or "
-        )
+    if (found.scale, found.by) == (TERMS[0], "turn") and not is_corrected:
+        offer = "correct the way by the turn with --by-turn, or "
     return (
         f"{found.scale} depends on the {found.by}: {', '.join(bins)}, {last} beyond; that is {found.share:.0%} of the "
         f"variance of {found.axis}: {offer}state that spread in the covariance (add the square of {found.reach:.2g} "

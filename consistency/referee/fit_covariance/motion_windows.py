@@ -1,4 +1,7 @@
-"""Windows of one span, which do not overlap, each in a few pieces; jumps and windows without motion are left out."""
+"""Windows of one span, which do not overlap, each in a few pieces; jumps and windows without motion are left out.
+
+A piece is a motion as a vector (n,): its shift, in the frame of its beginning, and its rotation vector.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.geometry.groups import inverse, log, matrices
+from consistency.referee.geometry.lie_groups import inverse, log, matrices, vectors
 from consistency.referee.readers.windows import Relative, relative_of, windows
 from consistency.referee.types import Array, Indices
 
@@ -28,7 +31,7 @@ ROWS = ("drive", "first", "last", "pieces", "true", "true_pieces")  # what there
 
 @dataclass(frozen=True)
 class DriveWindows:
-    """W windows of some drives, in P pieces of estimated motion each; a piece that is the identity is none."""
+    """W windows of some drives, in P pieces of estimated motion each; a piece of 0 is none."""
 
     drives: tuple[Drive, ...] = field(repr=False)
     span: Relative
@@ -36,9 +39,9 @@ class DriveWindows:
     drive: Indices  # (W,), index of the drive
     first: Indices  # (W,), rows of the drive
     last: Indices  # (W,)
-    pieces: Array  # (W, P, d + 1, d + 1), motions
-    true: Array  # (W, d + 1, d + 1), of the whole window
-    true_pieces: Array  # (W, P, d + 1, d + 1)
+    pieces: Array  # (W, P, n)
+    true: Array  # (W, d + 1, d + 1), motion of the whole window
+    true_pieces: Array  # (W, P, n)
     long: int = 0  # windows left out because rows or truth are missing
     still: int = 0  # left out, with hardly any motion
     jumps: int = 0  # left out, with a jump
@@ -77,10 +80,6 @@ class DriveWindows:
         """Some of the windows, by index or mask."""
         return replace(self, **{name: getattr(self, name)[keep] for name in ROWS})
 
-    def lengthened(self, slip: float) -> DriveWindows:
-        """The same windows with a longer estimated way in each piece that turns."""
-        return replace(self, pieces=lengthened(self.pieces, slip))
-
     def over(self, size: float) -> DriveWindows | None:
         """Windows of all drives over a span of another size, in pieces of the same size; None where none fits.
 
@@ -110,12 +109,7 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(
-    drives: Sequence[Drive],
-    span: Relative,
-    planar: bool = False,
-    pieces: int = PIECES,
-) -> DriveWindows:
+def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
     """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
@@ -128,52 +122,39 @@ def cut_windows(
     InputError
         No window fits in any drive.
     """
-    parts: list[DriveWindows] = []
-    refused: InputError | None = None
-    for number in range(len(drives)):
+    parts = []
+    long = 0
+    refused: list[InputError] = []
+    for number, drive in enumerate(drives):
         try:
-            parts.append(_cut_drive(tuple(drives), number, span, planar, pieces))
+            first, last, left_out = _rows_of_windows(drive, span)
         except InputError as error:
-            refused = error
+            refused.append(error)
+            continue
+        ends = _ends(first, last, pieces)
+        estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:], planar)
+        true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:], planar)
+        true = matrices_of(motions_between(drive.truth, first, last, planar))
+        parts.append((np.full(len(first), number), first, last, estimated, true, true_pieces))
+        long += left_out
     if not parts:
-        assert refused is not None
-        raise refused
-    rows: dict[str, Any] = {}
-    for name in ROWS:
-        rows[name] = np.concatenate([getattr(part, name) for part in parts])
-    found = replace(parts[0], **rows, long=sum(part.long for part in parts))
+        raise refused[-1]
+    rows: dict[str, Any] = dict(zip(ROWS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
+    found = DriveWindows(tuple(drives), span, planar, **rows, long=long)
     moves = _moves(found)
     jumps = _jumps(found)
     sound = moves & ~jumps
     if not sound.any():
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
-    still = int((~moves).sum())
-    return replace(found, still=still, jumps=int((moves & jumps).sum())).of(sound)
+    counted = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
+    return counted.of(sound)
 
 
-def _cut_drive(
-    drives: tuple[Drive, ...],
-    number: int,
-    span: Relative,
-    planar: bool,
-    pieces: int,
-) -> DriveWindows:
-    drive = drives[number]
-    position = drive.truth[:, :-1, -1]
-    rows = drive.row if span.unit == "step" else np.arange(len(position))
-    first, last, left_out = windows(drive.t, position, rows, span, drive.name)
-    first = np.searchsorted(rows, first)
-    last = np.searchsorted(rows, last)
-    ends = _ends(first, last, pieces)
-    estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:])
-    true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:])
-    true = motions_between(drive.truth, first, last)
-    if planar and drive.d == 3:
-        estimated = in_plane(estimated)
-        true_pieces = in_plane(true_pieces)
-        true = in_plane(true)
-    index = np.full(len(first), number)
-    return DriveWindows(drives, span, planar, index, first, last, estimated, true, true_pieces, left_out)
+def _rows_of_windows(drive: Drive, span: Relative) -> tuple[Indices, Indices, int]:
+    """First and last row of each window of a drive, and how many are left out."""
+    rows = drive.row if span.unit == "step" else np.arange(len(drive.t))
+    first, last, left_out = windows(drive.t, drive.truth[:, :-1, -1], rows, span, drive.name)
+    return np.searchsorted(rows, first), np.searchsorted(rows, last), left_out
 
 
 def _ends(first: Indices, last: Indices, pieces: int) -> Indices:
@@ -188,15 +169,16 @@ def _moves(of: DriveWindows) -> Array:
     if of.span.unit == "m":
         return np.asarray(way >= STILL * of.span.size)
     angle = angles(of.pieces).sum(axis=1)
-    return np.asarray((way > STILL * np.median(way)) | (angle > STILL * np.median(angle)))
+    goes = way > STILL * np.median(way)
+    turns = angle > STILL * np.median(angle)
+    return np.asarray(goes | turns)
 
 
 def _jumps(of: DriveWindows) -> Array:
     """Which windows have a piece whose error, of position or rotation, is a jump in its drive, (W,)."""
-    W, P = of.pieces.shape[:2]
-    gaps = inverse(of.pieces) @ of.true_pieces
-    flat = gaps.reshape(W * P, of.d + 1, of.d + 1)
-    errors = log(flat).reshape(W, P, -1)
+    gaps = inverse(matrices_of(of.pieces)) @ matrices_of(of.true_pieces)
+    W, P, size, _ = gaps.shape
+    errors = log(gaps.reshape(W * P, size, size)).reshape(W, P, -1)
     ends = _ends(of.first, of.last, P)
     errors[ends[:, 1:] == ends[:, :-1]] = np.nan  # a piece without a row
     positions = slice(0, of.d), 0.0
@@ -215,77 +197,73 @@ def _jumps(of: DriveWindows) -> Array:
     return found
 
 
-# --- motions in pieces ------------------------------------------------------------------------------------------------
+# --- motions as vectors -----------------------------------------------------------------------------------------------
 
 
-def motions_between(T: Array, first: Indices, last: Indices) -> Array:
-    """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first."""
-    return inverse(T[first]) @ T[last]
+def motions_between(T: Array, first: Indices, last: Indices, planar: bool = False) -> Array:
+    """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first, (..., n)."""
+    motions = inverse(T[first]) @ T[last]
+    if planar and T.shape[-1] == 4:
+        motions = in_plane(motions)
+    return vectors_of(motions)
 
 
 def in_plane(T: Array) -> Array:
-    """Motions in space (..., 4, 4) as x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
+    """Motions in space (..., 4, 4) as those of x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
     yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
-    poses = np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1)
-    flat = matrices(poses.reshape(-1, 3))
-    return flat.reshape(*yaw.shape, 3, 3)
+    return matrices_of(np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1))
+
+
+def matrices_of(motions: Array) -> Array:
+    """Homogeneous matrices (..., d + 1, d + 1) of motions (..., n)."""
+    flat = motions.reshape(-1, motions.shape[-1])
+    if flat.shape[1] == 6 and len(flat):
+        turns = Rotation.from_rotvec(flat[:, 3:])
+        flat = np.column_stack([flat[:, :3], turns.as_quat()])
+    T = matrices(flat)
+    return T.reshape(*motions.shape[:-1], *T.shape[1:])
+
+
+def vectors_of(T: Array) -> Array:
+    """Motions (..., n) of homogeneous matrices (..., d + 1, d + 1)."""
+    flat = T.reshape(-1, *T.shape[-2:])
+    if flat.shape[1] == 3 or not len(flat):
+        out = vectors(flat)[:, :6]
+    else:
+        turns = Rotation.from_matrix(flat[:, :3, :3])
+        out = np.column_stack([flat[:, :3, 3], turns.as_rotvec()])
+    return out.reshape(*T.shape[:-2], out.shape[1])
+
+
+def d_of(motions: Array) -> int:
+    """2 of motions (..., 3) in the plane, 3 of motions (..., 6) in space."""
+    return 2 if motions.shape[-1] == 3 else 3
+
+
+def ways(motions: Array) -> Array:
+    """Length of each motion (..., n), m."""
+    return norms(motions[..., : d_of(motions)])
+
+
+def angles(motions: Array) -> Array:
+    """Angle by which each motion (..., n) turns, rad, at least 0."""
+    return norms(motions[..., d_of(motions) :])
+
+
+def turn_per_way(motions: Array) -> Array:
+    """Angle over length of each motion, rad/m; 0 of one that turns without a way."""
+    way = ways(motions)
+    return angles(motions) / np.where(way > 0, way, np.inf)
 
 
 def rests(pieces: Array) -> Array:
-    """Motion from the beginning of each piece to the end of its window, (W, P, ...) -> (W, P + 1, ...)."""
-    W, P, m, _ = pieces.shape
-    out = np.empty((W, P + 1, m, m))
-    out[:, P] = np.eye(m)
+    """Motion from the beginning of each piece to the end of its window, (W, P, n) -> (W, P + 1, d + 1, d + 1)."""
+    T = matrices_of(pieces)
+    W, P, size, _ = T.shape
+    out = np.empty((W, P + 1, size, size))
+    out[:, P] = np.eye(size)
     for k in reversed(range(P)):
-        out[:, k] = pieces[:, k] @ out[:, k + 1]
-    return out
-
-
-def ways(pieces: Array) -> Array:
-    """Length of each piece, (W, P), m."""
-    return norms(pieces[..., :-1, -1])
-
-
-def rotation_vectors(pieces: Array) -> Array:
-    """Rotation vectors (W, P, 3), or (W, P, 1) in the plane, rad."""
-    if pieces.shape[-1] == 3:
-        return np.arctan2(pieces[..., 1, 0], pieces[..., 0, 0])[..., None]
-    shape = (*pieces.shape[:2], 3)
-    if pieces.size == 0:
-        return np.empty(shape)
-    turns = Rotation.from_matrix(pieces[..., :3, :3].reshape(-1, 3, 3))
-    return np.asarray(turns.as_rotvec().reshape(shape))
-
-
-def angles(pieces: Array) -> Array:
-    """Angle by which each piece turns, (W, P), rad, at least 0."""
-    return norms(rotation_vectors(pieces))
-
-
-def rotated(pieces: Array, vectors: Array) -> Array:
-    """Pieces with other rotations, of rotation vectors (W, P, 3) or (W, P, 1)."""
-    out = np.array(pieces)
-    if pieces.shape[-1] == 3:
-        out[..., 0, 0] = out[..., 1, 1] = np.cos(vectors[..., 0])
-        out[..., 1, 0] = np.sin(vectors[..., 0])
-        out[..., 0, 1] = -out[..., 1, 0]
-    elif pieces.size:
-        turns = Rotation.from_rotvec(vectors.reshape(-1, 3))
-        out[..., :3, :3] = turns.as_matrix().reshape(*pieces.shape[:2], 3, 3)
-    return out
-
-
-def turn_per_way(pieces: Array) -> Array:
-    """Angle over length of each piece, (W, P), rad/m; 0 where a piece turns without a way."""
-    way = ways(pieces)
-    return angles(pieces) / np.where(way > 0, way, np.inf)
-
-
-def lengthened(pieces: Array, slip: float) -> Array:
-    """Motions whose way is longer by ``slip`` for each radian of their turn; none goes backwards by this."""
-    out = np.array(pieces)
-    factor = np.maximum(1.0 + slip * turn_per_way(pieces), 0.0)
-    out[..., :-1, -1] *= factor[..., None]
+        out[:, k] = T[:, k] @ out[:, k + 1]
     return out
 
 
@@ -300,6 +278,11 @@ def norms(vectors: Array) -> Array:
 def mean_square(errors: Array) -> Array:
     """Mean square of each axis, (W, ...) -> (...)."""
     return np.asarray((errors**2).mean(axis=0))
+
+
+def root_mean_square(errors: Array) -> Array:
+    """Root of the mean square of each axis, (W, n) -> (n,), above 0."""
+    return np.maximum(np.sqrt(mean_square(errors)), 1e-150)
 
 
 def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:

@@ -11,7 +11,7 @@ from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.covariance_ratios import Fold
 from consistency.referee.fit_covariance.motion_windows import DriveWindows
-from consistency.referee.geometry.groups import composed, propagated, to_left, vectors
+from consistency.referee.geometry.lie_groups import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
@@ -24,24 +23,36 @@ from consistency.referee.fit_covariance.covariance_ratios import (
     Fold,
     JudgedSpan,
     Ratio,
-    are_halves,
     folds_of,
     judged_by,
 )
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.mean_by_motion import MotionDependence, mean_by_motion
-from consistency.referee.fit_covariance.motion_windows import ENOUGH, PIECES, DriveWindows, cut_windows, span_of
-from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
-from consistency.referee.fit_covariance.persistence import (
+from consistency.referee.fit_covariance.mean_differences import (
+    MotionDependence,
     PersistentError,
-    SecondErrors,
-    doubts,
-    errors_of_second,
+    mean_by_motion,
     persistent_errors,
 )
-from consistency.referee.fit_covariance.refusals import RotationGrowth, require_poses, require_sound, rotation_growth
+from consistency.referee.fit_covariance.motion_windows import (
+    ENOUGH,
+    PIECES,
+    DriveWindows,
+    cut_windows,
+    matrices_of,
+    span_of,
+    vectors_of,
+)
+from consistency.referee.fit_covariance.motions import record_of_motions, stretches_of
+from consistency.referee.fit_covariance.refusals import (
+    RotationGrowth,
+    doubts,
+    require_poses,
+    require_sound,
+    rotation_growth,
+)
+from consistency.referee.fit_covariance.second_estimator import SecondErrors, errors_of_second
 from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
-from consistency.referee.geometry.groups import log, matrices
+from consistency.referee.geometry.lie_groups import log, matrices
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
@@ -59,8 +70,7 @@ class NoiseModel:
     per_m: tuple[Interval, ...]  # (n,), variances a metre
     per_rad: tuple[Interval, ...]  # (n,)
     spans: tuple[JudgedSpan, ...]  # the first is that of the fit
-    record: Record = field(repr=False)  # judged motions, each a run
-    verdict: Verdict = field(repr=False)  # of the referee on these motions
+    verdict: Verdict = field(repr=False)  # of the referee on judged motions, each a run
     fitted_drives: tuple[str, ...]
     judged_drives: tuple[str, ...]
     held_out: str  # "in turn", "half" or names
@@ -100,7 +110,7 @@ class NoiseModel:
 
     def correct(self, motions: ArrayLike) -> Array:
         """Estimated motions (K, 3) or (K, 7) with the mean error taken out, as matrices (K, d + 1, d + 1)."""
-        return np.asarray(self.noise.mean.corrected(_matrices(motions, self.noise)[None])[0])
+        return matrices_of(self.noise.mean.corrected(_motions(motions, self.noise)))
 
     def covariance(self, motion: ArrayLike) -> Array:
         """Covariance (n, n) of Log(D^-1 M) of a corrected motion D: the error in the body's frame at its end.
@@ -114,7 +124,7 @@ class NoiseModel:
         InputError
             The motion is not of the model's space, or not finite.
         """
-        steps = _matrices(motion, self.noise)
+        steps = _motions(motion, self.noise)
         if len(steps) == 1:
             steps = evenly(steps[0], PIECES)
         return np.asarray(self.noise.covariance(steps[None])[0])
@@ -194,10 +204,12 @@ def fit_covariance(
     require_sound(windows, correct)
     jitter = jitter_of(fit_noise(windows, correct, by_turn), windows)
     fit = partial(fit_noise, correct=correct, by_turn=by_turn, jitter=jitter)
+    if held_out is None and len(drives) == 1:
+        held_out = HALF
+    by_halves = held_out == HALF
     noise, folds = folds_of(windows, held_out, fit)
     growth = rotation_growth(windows, noise.mean)
     lasting = persistent_errors(noise, windows)
-    by_halves = are_halves(windows, held_out)
     if cautious is not None:
         factor = caution(judged_by(folds, windows, not by_halves).whole, cautious)
         noise = replace(noise, factor=factor)
@@ -205,8 +217,9 @@ def fit_covariance(
     spans = _judge_spans(folds, windows, not by_halves)
     record = record_of_motions(stretches_of(windows, folds), windows.axes)
     judged = np.unique(np.concatenate([fold.judged for fold in folds]))
-    is_by_name = not (by_halves or held_out is None)
-    fitted = windows.of(~np.isin(windows.drive, judged)) if is_by_name else windows
+    fitted = windows
+    if held_out not in (None, HALF):
+        fitted = windows.of(~np.isin(windows.drive, judged))
     n = len(windows.axes)
     variances = variance_intervals(noise, fitted)
     return NoiseModel(
@@ -216,11 +229,10 @@ def fit_covariance(
         per_m=variances[:n],
         per_rad=variances[n:],
         spans=spans,
-        record=record,
         verdict=judge(record, keep_record=True),
         fitted_drives=tuple(drives[i].name for i in np.unique(fitted.drive)),
         judged_drives=tuple(drives[i].name for i in judged),
-        held_out=HALF if by_halves else held_out or IN_TURN,
+        held_out=held_out or IN_TURN,
         growth=growth,
         warnings=tuple(doubts(noise, windows, growth, lasting)),
         lasting=lasting,
@@ -251,23 +263,25 @@ def caution(ratio: Ratio, probability: float) -> float:
 
 
 def evenly(motion: Array, pieces: int) -> Array:
-    """Divide a motion (d + 1, d + 1) into equal pieces of one screw, (pieces, d + 1, d + 1)."""
-    twist = log(motion[None])[0] / pieces
-    d = motion.shape[-1] - 1
-    x, y, z = twist[d:] if d == 3 else (0.0, 0.0, twist[d])
-    rotation = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    generator = np.zeros((d + 1, d + 1))
-    generator[:d, :d] = rotation[:d, :d]
+    """Divide a motion (n,) into equal pieces of one screw, (pieces, n)."""
+    T = matrices_of(motion[None])
+    twist = log(T)[0] / pieces
+    d = len(T[0]) - 1
+    turn = np.zeros(3)
+    turn[d - len(twist) :] = twist[d:]
+    generator = np.zeros_like(T[0])
+    generator[:d, :d] = np.cross(turn, np.eye(3)).T[:d, :d]
     generator[:d, d] = twist[:d]
-    return np.repeat(linalg.expm(generator)[None], pieces, axis=0)
+    return np.repeat(vectors_of(linalg.expm(generator)[None]), pieces, axis=0)
 
 
-def _matrices(motion: ArrayLike, noise: WhiteNoise) -> Array:
-    values = np.atleast_2d(np.asarray(motion, float))
+def _motions(given: ArrayLike, noise: WhiteNoise) -> Array:
+    """Motions (K, n) of poses (K, 3) or (K, 7), or of one."""
+    values = np.atleast_2d(np.asarray(given, float))
     width = 3 if len(noise.axes) == 3 else 7
     if values.ndim != 2 or values.shape[1] != width or not np.isfinite(values).all():
-        raise InputError(f"motion: needs {width} finite numbers a step, got an array of {np.shape(motion)}")
-    return matrices(values)
+        raise InputError(f"motion: needs {width} finite numbers a step, got an array of {np.shape(given)}")
+    return vectors_of(matrices(values))
 
 
 def _is_planar(drives: Sequence[Drive], axes: int | None) -> bool:

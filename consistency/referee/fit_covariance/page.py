@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -16,11 +16,12 @@ from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, ZERO, so
 from consistency.referee.fit_covariance.correct import Correction
 from consistency.referee.fit_covariance.correction_text import correction_document
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan
+from consistency.referee.fit_covariance.likelihood import nees_of
 from consistency.referee.fit_covariance.model_text import noise_document
-from consistency.referee.fit_covariance.motion_windows import span_of
+from consistency.referee.fit_covariance.motion_windows import mean_square, span_of
 from consistency.referee.fit_covariance.noise_model import NoiseModel, error_windows
-from consistency.referee.fit_covariance.white_noise import nees_of
-from consistency.referee.show.painting import (
+from consistency.referee.pages.trajectory import ellipse
+from consistency.referee.show.matplotlib_style import (
     canvas,
     curve,
     dots,
@@ -42,66 +43,52 @@ SHOWN = 3  # spans with a panel of errors
 MOST_ROWS = 30  # runs that have a row
 ROW = 0.14  # in, height of one
 MANY = 2000  # errors of motions that are drawn
-CIRCLE = np.linspace(0.0, 2.0 * np.pi, 121)
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
-def page_of(said: Document, figures: tuple[Figure, ...]) -> Document:
-    """A document with its pictures."""
-    return replace(said, chapters=(Chapter("", "", "", figures),))
+def page_of(said: Document, title: str, caption: str, draw: Callable[[], Drawing]) -> Document:
+    """A document with its picture."""
+    return replace(said, chapters=(Chapter("", "", "", (Figure(title, caption, (draw,)),)),))
+
+
+# --- noise models -----------------------------------------------------------------------------------------------------
 
 
 def noise_page(model: NoiseModel) -> Document:
-    """What the model says, and its pictures."""
-    return page_of(noise_document(model), noise_figures(model))
-
-
-def noise_figures(model: NoiseModel) -> tuple[Figure, ...]:
-    """Errors of motions, growth of the errors, and the drives."""
-    errors = (
+    """What the model says, and its picture."""
+    caption = (
         "Errors of corrected motions in x and y, in the body's frame at their end, with the ellipse that holds "
-        "95 % of them where the covariance is right (the mean of all windows)."
+        "95 % of them where the covariance is right (the mean of all windows). Below: mean squared error of each axis "
+        "over the span (markers) beside the model, which is fitted at the shortest span alone (lines); and the ratio "
+        "of true to stated covariance of each judged drive."
     )
-    growth = (
-        "Mean squared error of each axis over the span (markers) beside the model, which is fitted at the shortest "
-        "span alone (lines); and the ratio of true to stated covariance of each judged drive."
-    )
-    return (
-        Figure("Errors of motions", errors, (partial(draw_noise, model, below=False),)),
-        Figure("Growth and ratios", growth, (partial(draw_noise, model, above=False),)),
-    )
+    return page_of(noise_document(model), "Errors of motions, growth and ratios", caption, partial(draw_noise, model))
 
 
-def draw_noise(model: NoiseModel, above: bool = True, below: bool = True) -> Drawing:
+def draw_noise(model: NoiseModel) -> Drawing:
     """Errors of the first spans, a panel each, and below them growth and drives."""
     spans = model.spans[:SHOWN]
     axes = range(len(model.noise.axes))
-    d = 2 if len(axes) == 3 else 3
-    many = above * len(spans) + below * 3
-    figure, panels = canvas(2.0 * -(-many // 3), 3, many)
-    if above:
-        for panel, judged in zip(panels, spans, strict=False):
-            _draw_errors(panel, model, judged)
-    if below:
-        growth, turns, drives = panels[-3:]
-        _draw_growth(growth, model, axes[:d], "m²")
-        _draw_growth(turns, model, axes[d:], "rad²")
-        _draw_drives(drives, model)
+    d = model.windows.d
+    figure, panels = canvas(4.0, 3, len(spans) + 3)
+    for panel, judged in zip(panels, spans, strict=False):
+        _draw_errors(panel, model, judged)
+    growth, turns, drives = panels[-3:]
+    _draw_growth(growth, model, axes[:d], "m²")
+    _draw_growth(turns, model, axes[d:], "rad²")
+    _draw_drives(drives, model)
     return figure
 
 
 def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
     windows = error_windows(model, judged)
-    error, C = windows.errors, model.noise.covariance(windows.pieces).mean(axis=0)[:2, :2]
-    values, vectors = np.linalg.eigh(C)
-    radius = np.sqrt(float(stats.chi2.ppf(CONFIDENCE, 2)))
-    ellipse = radius * (vectors * np.sqrt(np.maximum(values, 0.0))) @ np.array([np.cos(CIRCLE), np.sin(CIRCLE)])
-    squared = nees_of(error[:, :2], model.noise.covariance(windows.pieces)[:, :2, :2])
-    inside = float((stats.chi2.cdf(squared, 2) < CONFIDENCE).mean())
+    error = windows.errors[:, :2]
+    C = model.noise.covariance(windows.pieces)[:, :2, :2]
+    inside = float((nees_of(error, C) < stats.chi2.ppf(CONFIDENCE, 2)).mean())
     axes.axvline(0.0, **stroke(ZERO))
     axes.axhline(0.0, **stroke(ZERO))
     points(axes, error[:, 0], error[:, 1], EACH, limit=MANY)
-    path(axes, ellipse.T, solid(style(1)))
+    path(axes, ellipse(np.zeros(2), C.mean(axis=0)), solid(style(1)))
     title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
     axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 
@@ -109,10 +96,8 @@ def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
 def _draw_growth(panel: Axes, model: NoiseModel, axes: Sequence[int], unit: str) -> None:
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
-    squares = np.array([(windows.errors**2).mean(axis=0) for windows in found])
-    stated = np.array([
-        np.diagonal(model.noise.covariance(windows.pieces), axis1=1, axis2=2).mean(axis=0) for windows in found
-    ])  # fmt: skip
+    squares = np.array([mean_square(windows.errors) for windows in found])
+    stated = np.array([model.noise.variances(windows.pieces).mean(axis=0) for windows in found])
     for number, axis in enumerate(axes):
         curve(panel, spans, stated[:, axis], solid(style(number)))
         panel.plot(spans, squares[:, axis], label=model.noise.axes[axis], **dots(style(number)))
@@ -151,8 +136,8 @@ def correction_page(found: Correction) -> Document:
         "Ratio of true to stated covariance of each held-out run, as stated and corrected; the factor of each block "
         "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
     )
-    figure = Figure("Held-out runs, factors and coverage", caption, (partial(draw_correction, found),))
-    return page_of(correction_document(found), (figure,))
+    title = "Held-out runs, factors and coverage"
+    return page_of(correction_document(found), title, caption, partial(draw_correction, found))
 
 
 def draw_correction(found: Correction) -> Drawing:

@@ -7,22 +7,21 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
-from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.fit_covariance.intervals import student
 from consistency.referee.fit_covariance.motion_windows import (
     BLOCKS,
     DriveWindows,
     blocks_of,
-    lengthened,
+    d_of,
+    matrices_of,
     mean_square,
     rests,
-    rotated,
-    rotation_vectors,
+    root_mean_square,
     turn_per_way,
     ways,
 )
-from consistency.referee.geometry.groups import adjoint, inverse
+from consistency.referee.geometry.lie_groups import adjoint, inverse
 from consistency.referee.types import Array
 
 ROUNDS = 2  # of Gauss and Newton from nothing; from a mean that is nearly right one is enough
@@ -52,11 +51,13 @@ class Mean:
         return np.array([self.way, self.turn, *self.drift])
 
     def corrected(self, pieces: Array) -> Array:
-        """Motions (W, P, d + 1, d + 1) with this mean taken out."""
-        pieces = lengthened(pieces, self.slip)
-        drifts = ways(pieces)[..., None] * np.asarray(self.drift)
-        out = rotated(pieces, self.turn * rotation_vectors(pieces) + drifts)
-        out[..., :-1, -1] *= self.way
+        """Motions (..., n) with this mean taken out; none goes backwards by a slip."""
+        d = d_of(pieces)
+        way = ways(pieces)[..., None]
+        longer = np.maximum(1.0 + self.slip * turn_per_way(pieces)[..., None], 0.0)
+        out = self.turn * pieces
+        out[..., :d] = self.way * longer * pieces[..., :d]
+        out[..., d:] += longer * way * np.array(self.drift)
         return out
 
     def applied(self, windows: DriveWindows) -> DriveWindows:
@@ -217,15 +218,15 @@ def estimate(
     step[free] = 0.0
     A = equations.A[:, free][:, :, free]
     left = equations.b[:, free] - equations.A[:, free] @ step
-    step[free] = _solve(A.sum(axis=0), left.sum(axis=0))
+    inverse_of_sum = scaled_inverse(A.sum(axis=0), WEAK**2)
+    step[free] = inverse_of_sum @ left.sum(axis=0)
     left = left - A @ step[free]
     blocks = blocks_of(windows.drive, BLOCKS)
     k = max(len(blocks), 2)
     sums = np.stack([left[block].sum(axis=0) for block in blocks], axis=1)
     squares = np.zeros(len(step))
-    squares[free] = (_solve(A.sum(axis=0), sums) ** 2).sum(axis=1)
-    quantile = float(stats.t.isf(0.5 * (1.0 - CONFIDENCE), k - 1))
-    reach = np.maximum(quantile * np.sqrt(squares * k / (k - 1)), 1e-12)
+    squares[free] = ((inverse_of_sum @ sums) ** 2).sum(axis=1)
+    reach = np.maximum(student(k) * np.sqrt(squares * k / (k - 1)), 1e-12)
     scales = start[:SCALES] * (1 + step[:SCALES])
     drift = start[SCALES:] * (1 + step[1]) + step[SCALES:] * near.way
     value = np.where(free, np.append(scales, drift), none)
@@ -234,19 +235,18 @@ def estimate(
     return Estimate(mean, value - reach, value + reach)
 
 
-def _solve(A: Array, b: Array) -> Array:
-    """x of A x = b, (p, p) and (p,) or (p, k); 0 in directions that are not determined."""
+def scaled_inverse(A: Array, weak: float) -> Array:
+    """Inverse of A (p, p), of coefficients of unlike sizes; 0 in directions that are weaker and not determined."""
     size = np.sqrt(np.maximum(np.abs(np.diag(A)), 1e-300))
-    scaled = A / np.outer(size, size)
-    x = np.linalg.lstsq(scaled, (b.T / size).T, rcond=WEAK**2)[0]
-    return np.asarray((x.T / size).T)
+    scale = np.outer(size, size)
+    return np.asarray(np.linalg.pinv(A / scale, rcond=weak) / scale)
 
 
 def _of_neighbours(windows: DriveWindows) -> Array:
     """Derivatives of the windows before and after, (W, n, p), less what is next to this one: its ends may be shared."""
     early = np.array(windows.pieces)
     late = np.array(windows.pieces)
-    early[:, -GAP:] = late[:, :GAP] = np.eye(windows.d + 1)
+    early[:, -GAP:] = late[:, :GAP] = 0.0
     return sum_of_neighbours(windows, jacobian_of_mean(early), jacobian_of_mean(late))
 
 
@@ -285,7 +285,7 @@ def left_by(X: Array, y: Array, weak: float | None = None) -> Array:
 def _lasts(corrected: DriveWindows) -> bool:
     """Whether rotation errors of windows one or two apart correlate positively; jitter of their ends does not."""
     error = corrected.errors[:, corrected.d :]
-    error = error / np.maximum(np.sqrt(mean_square(error)), 1e-300)
+    error = error / root_mean_square(error)
     for lag in (1, 2):
         same_drive = corrected.drive[lag:] == corrected.drive[:-lag]
         products = (error[lag:] * error[:-lag]).sum(axis=1)[same_drive]
@@ -304,18 +304,18 @@ def fit_slip(windows: DriveWindows) -> float:
     """
     slip = 0.0
     for _ in range(SLIP_ROUNDS):
-        longer = windows.lengthened(slip)
+        longer = Mean(slip=slip).applied(windows)
         mean = fit_mean(longer)
         corrected = mean.applied(longer)
         error = corrected.errors
-        size = np.maximum(np.sqrt(mean_square(error)), 1e-150)
+        size = root_mean_square(error)
         derivatives = (jacobian(corrected.pieces) / size[:, None]).reshape(error.size, -1)
         X, effect = derivatives[:, :-1], derivatives[:, -1]
         y = (error / size).ravel()
         left = left_by(X, effect)
         if not left @ left > APART * effect @ effect:
             return 0.0
-        slip += float(left @ left_by(X, y) / (left @ left)) / mean.way
+        slip += float(left @ y / (left @ left)) / mean.way
     return slip
 
 
@@ -324,14 +324,14 @@ def fit_slip(windows: DriveWindows) -> float:
 
 def jacobian(pieces: Array) -> Array:
     """Derivative (W, n, p + 1) of the errors by the p coefficients of a mean, and by a slip."""
-    d = pieces.shape[-1] - 1
-    turns = rotation_vectors(pieces)
-    axes = turns.shape[-1]
-    local = np.zeros((*turns.shape[:2], d + axes, SCALES + axes + 1))
-    along = -inverse(pieces)[..., :-1, -1]  # R' t: at the end of its piece a longer way is an error along it
+    d = d_of(pieces)
+    axes = pieces.shape[-1] - d
+    way = ways(pieces)
+    along = -inverse(matrices_of(pieces))[..., :-1, -1]  # R' t: at its end a longer way is an error along it
+    local = np.zeros((*pieces.shape, SCALES + axes + 1))
     local[..., :d, 0] = along
-    local[..., d:, 1] = turns
-    local[..., d:, SCALES:-1] = ways(pieces)[..., None, None] * np.eye(axes)
+    local[..., d:, 1] = pieces[..., d:]
+    local[..., d:, SCALES:-1] = way[..., None, None] * np.eye(axes)
     local[..., :d, -1] = along * turn_per_way(pieces)[..., None]
     W, P, n, p = local.shape
     A = np.moveaxis(carriers(pieces)[:, 1:], 1, 2)

@@ -12,8 +12,8 @@ import numpy as np
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.intervals import interval_of
+from consistency.referee.fit_covariance.likelihood import maximise, nees_of, score_of
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
-from consistency.referee.fit_covariance.scoring import maximise, score_of
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
@@ -52,7 +52,7 @@ class WhiteNoise:
         return np.concatenate([self.per_m, self.per_rad])
 
     def covariance(self, pieces: Array) -> Array:
-        """Covariances (W, n, n) of Log(D^-1 M), of corrected motions in pieces (W, P, d + 1, d + 1)."""
+        """Covariances (W, n, n) of Log(D^-1 M), of corrected motions in pieces (W, P, n)."""
         return self.factor * sum_of_terms(self.theta, terms_of(pieces), self.floor)
 
     def variances(self, pieces: Array) -> Array:
@@ -95,7 +95,7 @@ def fit_noise(
         )
     if by_turn:
         slip = fit_slip(windows)
-        noise = fit_noise(windows.lengthened(slip), jitter=jitter)
+        noise = fit_noise(Mean(slip=slip).applied(windows), jitter=jitter)
         return replace(noise, mean=replace(noise.mean, slip=slip))
     fit, mean, theta = None, no_mean(windows), None
     if correct:
@@ -266,9 +266,3 @@ def _start(error: Array, F: Array) -> Array:
     own = F.mean(axis=0)[np.arange(F.shape[1]), axis, axis]
     square = mean_square(error)[axis]
     return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)
-
-
-def nees_of(error: Array, C: Array) -> Array:
-    """e' C^-1 e, (W,)."""
-    solved = np.linalg.solve(C, error[..., None])[..., 0]
-    return np.asarray((error * solved).sum(axis=1))

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.questions.innovations import nis_of
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip, skip_of
+from consistency.referee.diagnostics.records.skipped_start import Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.numpy_archive import steps_of
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.sources import Source
+from consistency.referee.verdicts.judge_sources import Source
 
 
 def record_of_checked(

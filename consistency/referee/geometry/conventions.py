@@ -4,7 +4,7 @@ The NEES is e' P^-1 e, so it is right only if P is the covariance of this very e
 order of components. The sign of e does not matter to it.
 
 Filters of the bench and files of other estimators are judged by the errors that are defined here; those of poses in
-space are in :mod:`consistency.referee.geometry.groups`.
+space are in :mod:`consistency.referee.geometry.lie_groups`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arra
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
-from consistency.referee.verdicts.sources import settings_of, skip_asked
+from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
 
 def read(

@@ -21,13 +21,13 @@ from consistency.referee.show import as_html
 def record_text(record: Record) -> str:
     runs, unit = plural(len(record.run_numbers), "run"), "step" if record.window is None else "window"
     size = f"{runs} x {plural(len(record.t), unit)}"
-    return f"<Record {record.name}: {size}, error {record.convention or '-'} of {', '.join(record.axes)}>"
+    return f"<Record {record.name}: {size}, error {record.convention or '-'} of {', '.join(record.names)}>"
 
 
 def record_html(record: Record) -> str:
     rows = (
         ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
-        ("components", ", ".join(record.axes)), ("failed runs", str(len(record.failures))),
+        ("components", ", ".join(record.names)), ("failed runs", str(len(record.failures))),
     )  # fmt: skip
     return f"<div><strong>{escape(record.name)}</strong>{as_html.fragment(Facts(rows), Bullets(record.notes))}</div>"
 

@@ -11,11 +11,10 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural, with_subject
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text
-from consistency.referee.pages import questions, verdicts
-from consistency.referee.pages.by_axis import by_axis
-from consistency.referee.pages.by_group import by_group
-from consistency.referee.pages.judged import Estimator, Judged, clock_of
-from consistency.referee.pages.origin import facts
+from consistency.referee.pages import questions_table, verdicts
+from consistency.referee.pages.judged_estimators import Estimator, Judged, time_axis_of
+from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.pages.ratio_figures import by_axis, ratio_by_group_figure
 from consistency.referee.pages.record_figures import record_figures
 
 
@@ -34,14 +33,14 @@ def compose_files(
             (
                 *[Text(with_subject(name, _ended(verdict.reasons[0])))] * several,
                 *record_figures(named[name], verdict),
-                *by_group(verdict),
+                *ratio_by_group_figure(verdict),
             ),
             _counts(named[name], verdict),
         )
         for i, (name, verdict) in enumerate(judged.items())
     ]
     blocks = (
-        *verdicts.judgement(study), *questions.diagnosis(study), *by_axis(study),
+        *verdicts.judgement(study), *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))
@@ -72,11 +71,11 @@ def _ended(sentence: str) -> str:
 def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
     tracks = tuple(Estimator(v.filter, i, f"0-{i}", v, v.failures) for i, v in enumerate(judged))
     runs, steps = max(v.runs for v in judged), max(v.steps for v in judged)
-    return Judged(title, "", runs, 0, clock_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
+    return Judged(title, "", runs, 0, time_axis_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
 def _counts(record: Record, verdict: Verdict) -> str:
-    clock = clock_of(record.t)
+    clock = time_axis_of(record.t)
     length = plural(verdict.steps, "step" if record.window is None else "window")
     size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
     return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size

@@ -10,7 +10,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
 from consistency.referee.document.colours import EXPECTED, LIMIT, style
-from consistency.referee.show.painting import canvas, curve, log_axis, points, stroke
+from consistency.referee.show.matplotlib_style import canvas, curve, log_axis, points, stroke
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import Watched
 

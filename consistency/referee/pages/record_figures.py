@@ -20,9 +20,9 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, solid, style
 from consistency.referee.errors import InputError
-from consistency.referee.pages.judged import Clock, clock_of, wide
+from consistency.referee.pages.judged_estimators import Clock, time_axis_of, wide
 from consistency.referee.pages.trajectory import shown_run, trajectory_panel
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     WIDTH,
     add_legend,
     band,
@@ -161,8 +161,8 @@ def errors_of(record: Record) -> list[Errors]:
     assert record.error is not None
     assert record.covariance is not None
     found = []
-    for i, name in enumerate(record.axes[:MOST_PANELS]):
-        unit, factor = unit_of(name)
+    for i, name in enumerate(record.names[:MOST_PANELS]):
+        unit, factor = unit_of(record.axes[i])
         bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, :, i, i], 0.0))
         found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
     return found
@@ -181,7 +181,7 @@ def _errors(record: Record) -> Picture | None:
             f"About 95 % of honest errors are inside.{more}"
         )
         return Picture("Errors and stated bounds", caption, tuple(_errors_of_runs(record, c) for c in components))
-    clock, row = clock_of(record.t), shown_run(record)
+    clock, row = time_axis_of(record.t), shown_run(record)
     meaning = "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
     caption = (
         f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
@@ -224,7 +224,7 @@ def _errors_over_sigma(record: Record) -> Picture | None:
     """Error of each component over the standard deviation that is stated for it."""
     if record.error is None or record.covariance is None or has_one_step(record):
         return None
-    clock, row = clock_of(record.t), shown_run(record)
+    clock, row = time_axis_of(record.t), shown_run(record)
     caption = (
         f"Error over its stated standard deviation, of run {record.run_numbers[row]} and others. Shaded: 2 sigma, "
         f"inside which honest errors stay about 95 % of the time.{clock.note}"
@@ -250,7 +250,7 @@ def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
         axes.axhline(0.0, **stroke(ZERO))
         curve(axes, clock.values, scaled[row], SHOWN, f"run {record.run_numbers[row]}")
         reach = max(LEAST_REACH, 1.1 * _most(scaled))
-        axes.set(ylabel=f"{record.axes[axis]} / sigma", ylim=(-reach, reach))
+        axes.set(ylabel=f"{record.names[axis]} / sigma", ylim=(-reach, reach))
         clock.name(axes)
 
     return paint
@@ -293,7 +293,7 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
     scale, location = verdict.scale, verdict.location
     if scale is None or len(scale.anees) != len(record.t):
         return None
-    clock = clock_of(record.t)
+    clock = time_axis_of(record.t)
     name = "NEES" if verdict.runs == 1 else f"NEES, average of {verdict.runs} runs"
     simultaneous = None
     if location is not None and np.isfinite(location.simultaneous).any():
@@ -329,7 +329,7 @@ def _worst_run(record: Record) -> Picture | None:
         return None
     counts = np.maximum(there.sum(axis=1), 1)
     means = np.where(there.any(axis=1), np.where(there, nees, 0.0).sum(axis=1) / counts, np.nan)
-    worst, clock = int(np.nanargmax(means)), clock_of(record.t)
+    worst, clock = int(np.nanargmax(means)), time_axis_of(record.t)
     number = record.run_numbers[worst]
 
     def paint_runs(axes: Axes) -> None:
@@ -365,13 +365,13 @@ def _single_nees(record: Record) -> Picture | None:
         return None
     what, each, note = "each run", "one run", ""
     if record.independent:
-        note = clock_of(record.t).note
+        note = time_axis_of(record.t).note
         what, each = f"the motion over each window of {record.window or 'a step'}", "one window"
 
     def paint(axes: Axes) -> None:
         x, rows = record.run_numbers.astype(float), nees[:, :1].T
         if record.independent:
-            x, rows = clock_of(record.t).values, nees
+            x, rows = time_axis_of(record.t).values, nees
         ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
         axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5, label=f"95 % band of {each}")
         axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
@@ -381,7 +381,7 @@ def _single_nees(record: Record) -> Picture | None:
             label = ""
         axes.set_ylabel("NEES")
         if record.independent:
-            clock_of(record.t).name(axes)
+            time_axis_of(record.t).name(axes)
         else:
             _span_runs(axes, record)
         if wide([nees]):
@@ -408,7 +408,7 @@ def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
         sigma = np.sqrt(np.diagonal(record.covariance, axis1=-2, axis2=-1))
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.abs(record.error) / sigma
-        for i, name in enumerate(record.axes[:MOST_PANELS]):
+        for i, name in enumerate(record.names[:MOST_PANELS]):
             found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
     if record.nees is not None and record.dof and not record.parts:
         found["all together"] = _shares(record.nees, distributions.chi2.ppf(p, record.dof))
@@ -450,7 +450,7 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
     """NIS over its degrees of freedom, averaged over runs."""
     if record.nis is None or record.nis_dof is None:
         return None
-    clock = clock_of(record.t)
+    clock = time_axis_of(record.t)
     known = np.isfinite(record.nis) & (record.nis_dof > 0)
     dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
     least = np.maximum(dof, 1.0)

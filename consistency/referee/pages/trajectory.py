@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
-from consistency.referee.show.painting import dots, make_map, path
+from consistency.referee.show.matplotlib_style import dots, make_map, path
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | Non
             label = ""
         if len(steps):
             axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
-        axes.set(xlabel=f"{NAMES[pair[0]]} (m)", ylabel=f"{NAMES[pair[1]]} (m)")
+        x, y = (record.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
+        axes.set(xlabel=f"{x} (m)", ylabel=f"{y} (m)")
         make_map(axes)
 
     caption = f"Trajectory of {record.unit} {record.run_numbers[row]}, true and estimated."

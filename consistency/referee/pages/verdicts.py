@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
 from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
-from consistency.referee.pages.judged import Estimator, Judged
+from consistency.referee.pages.judged_estimators import Estimator, Judged
 
 FAILURES = (
     Column("Filter", width="1.4fr"),
@@ -20,7 +20,7 @@ STEP_1 = "A run that failed in step 1 has no estimates; a hang or a crash is cou
 
 def judgement(study: Judged) -> list[Block]:
     """Table and sentences of one study, and its failed runs."""
-    reasons = Reasons(tuple(reason(track.verdict, track.name, track.look) for track in study.tracks))
+    reasons = Reasons(tuple(reason(track.verdict, track.name, track.look, verbose=False) for track in study.tracks))
     view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
     cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
     label = f"Verdicts of {study.name}"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.programs.study import Plan, run_study
 from consistency.referee.programs.words import inputs_of, program_of
 from consistency.referee.readers.options import Reading
-from consistency.referee.verdicts.sources import settings_of, skip_asked
+from consistency.referee.readers.pipeline.program_runs import PATHS
+from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
 FOR_PLAN = ("until_decided", "max_runs", "seed", "jobs", "timeout", "check_seed", "keep", "optimal_gain")
 
@@ -128,20 +127,23 @@ def _run(
 ) -> tuple[list[Record], dict[str, Verdict]]:
     here = Path.cwd()
     of_plan = {name: options.pop(name) for name in FOR_PLAN if name in options}
-    known = [each.name for each in fields(Reading)]
-    if unknown := [name for name in options if name not in known]:
-        raise TypeError(f"monte_carlo: unknown option '{unknown[0]}'")
-    for name in ("truth", "covariance"):
-        path = truth if name == "truth" else options.get(name)
-        if path is not None:
-            options[name] = Path(path)
-    program = program_of(argv, here, None if cwd is None else Path(cwd))
+    for name in options:
+        if name not in Reading.__dataclass_fields__:
+            raise TypeError(f"monte_carlo: unknown option '{name}'")
+    options["truth"] = truth
+    for name in PATHS:
+        if options.get(name) is not None:
+            options[name] = Path(options[name])
+    if cwd is not None:
+        cwd = Path(cwd)
+    program = program_of(argv, here, cwd)
     inputs = () if each is None else inputs_of(each, here)
     plan = Plan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
-    place = nullcontext(str(out)) if out is not None else tempfile.TemporaryDirectory(prefix="consistency-")
-    with place as folder:
-        at = Path(folder) if out is not None else Path(folder) / "runs"
-        return run_study(program, plan, at, estimates, Reading(**options), resume, overwrite)
+    reading = Reading(**options)
+    if out is not None:
+        return run_study(program, plan, Path(out), estimates, reading, resume, overwrite)
+    with tempfile.TemporaryDirectory(prefix="consistency-") as folder:
+        return run_study(program, plan, Path(folder) / "runs", estimates, reading, resume, overwrite)
 
 
 def _chosen(records: Sequence[Record], name: str | None) -> Record:

@@ -18,7 +18,7 @@ import numpy as np
 from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
 from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
@@ -176,7 +176,8 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
     reading = {name: str(value) if name in PATHS else value for name, value in given.items() if value is not None}
     here = program.here
     return {
-        "words": list(program.words), "files": program.files(), "cwd": program.cwd and str(program.cwd),
+        "program": program.name, "words": list(program.words),
+        "files": program.files(), "cwd": program.cwd and str(program.cwd),
         "seed": plan.seed, "inputs": [os.path.relpath(path, here) for path in plan.inputs] or None,
         "estimates": estimates, "reading": reading, "runs": plan.runs, "until_decided": None, "complete": False,
         "keep": plan.keep, "settings": {key: value for key, value in vars(plan.settings).items() if value is not None},

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from consistency.referee.errors import InputError
+from consistency.referee.parsing import is_file, require_name
 from consistency.referee.readers.pipeline.program_runs import filled
 from consistency.referee.system.progress import say
 
 LARGEST_SEED = 2**31 - 1  # fits an int and std::stoi
 HALF = 2**16
 ROUNDS = 4  # of the Feistel network
+SCRIPTS = (".py", ".jl", ".m", ".r", ".sh", ".js", ".rb", ".lua", ".pl")  # files that an interpreter runs
 OF_A_RUN = ("{run}", "{seed}", "{out}", "{worker}", "{input}", "{name}")
 
 
@@ -44,6 +46,7 @@ class Program:
     words: tuple[str, ...]
     here: Path
     cwd: Path | None = None
+    name: str = ""  # what a verdict calls it
 
     @property
     def uses_run(self) -> bool:
@@ -96,7 +99,22 @@ def program_of(words: Sequence[str], here: Path, cwd: Path | None = None, hint: 
         cwd = here / cwd
         if not cwd.is_dir():
             raise InputError(f"--cwd {cwd}: no such folder")
-    return Program((first, *words[1:]), here, cwd)
+    return Program((first, *words[1:]), here, cwd, _name(words, here, cwd))
+
+
+def _name(words: Sequence[str], here: Path, cwd: Path | None) -> str:
+    """What the user calls a program: its file, or the script that an interpreter on the PATH runs."""
+    name = words[0]
+    if os.sep not in name:
+        for word in words[1:]:
+            file = (cwd or here) / filled(word, {"here": str(here)})
+            if file.suffix.lower() in SCRIPTS and is_file(file):
+                name = word
+                break
+    name = name.replace("{here}/", "")
+    if Path(name).is_absolute():
+        name = Path(name).name
+    return require_name(name, "the command")
 
 
 def _found(first: str, here: Path, hint: str) -> str:

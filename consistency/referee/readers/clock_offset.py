@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ MOST = 4000  # estimates that are looked at, of all runs together
 PARTS = 12  # that a single run is cut into
 CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts no more: a broken one decides nothing
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
+SHIFTS = np.geomspace(0.004, REACH, 12)
+GRID = np.concatenate([-SHIFTS[::-1], [0.0], SHIFTS])  # s, offsets of which the best is refined
 ROUNDS = 5  # of clocks and frames in turn
 SETTLED = 1e-4  # s, change of the offset that ends them
 RATE = 1e-4  # probability that an offset is named where there is none
@@ -95,20 +97,12 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
         sizes = [_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]
         return float(np.mean(sizes))
 
-    steps = np.geomspace(0.004, REACH, 12)
-    grid = np.concatenate([-steps[::-1], [0.0], steps])
-    sizes = np.array([size(shift) for shift in grid])
+    sizes = np.array([size(shift) for shift in GRID])
     at_rest = size(0.0)
     moves = np.isfinite(sizes).any() and np.nanmax(sizes) - np.nanmin(sizes) > 1e-9
     if not moves or not at_rest > 0.0:  # or no error is there to explain
         return None
-    best = int(np.nanargmin(sizes))
-    low = grid[max(best - 1, 0)]
-    high = grid[min(best + 1, len(grid) - 1)]
-    found = optimize.minimize_scalar(size, bounds=(low, high), method="bounded", options={"xatol": 1e-5})
-    value = float(grid[best])
-    if found.fun < sizes[best]:
-        value = float(found.x)
+    value = refined(size, sizes, 1e-5)
     parts = 1 if len(some) > 1 else PARTS
     each = np.concatenate([steps_of(poses, value, parts) for poses in some])
     each = value + each[np.isfinite(each)]
@@ -124,6 +118,14 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     is_gross = at_rest > GROSS and left < 0.5 * at_rest
     alone = len(some) == 1 and not is_gross
     return Offset(value, value - reach, value + reach, p, 1.0 - left / at_rest, alone)
+
+
+def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> float:
+    """The offset with the smallest size, near the best one of ``GRID``, with ``sizes`` there."""
+    best = int(np.nanargmin(sizes))
+    bounds = GRID[max(best - 1, 0)], GRID[min(best + 1, len(GRID) - 1)]
+    found = optimize.minimize_scalar(size, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return float(found.x if found.fun < sizes[best] else GRID[best])
 
 
 def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:

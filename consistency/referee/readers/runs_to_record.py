@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.large_arrays import of_runs
 from consistency.referee.diagnostics.records.record import Record, arrays_of
-from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, asymmetric, classify
+from consistency.referee.diagnostics.records.valid_covariances import ROUNDED, Validity, asymmetric, classify
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError

@@ -239,7 +239,7 @@ class Poses:
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
         error = planar_error
         if self.manifold == "spatial":
-            from consistency.referee.geometry.groups import state_error as error
+            from consistency.referee.geometry.lie_groups import state_error as error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 

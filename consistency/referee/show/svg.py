@@ -11,7 +11,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from consistency.referee.document.blocks import Document
-from consistency.referee.show.painting import FILTER, RC, TITLE, WIDTH
+from consistency.referee.show.matplotlib_style import FILTER, RC, TITLE, WIDTH
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

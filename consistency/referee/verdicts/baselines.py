@@ -14,7 +14,7 @@ import numpy as np
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.comparison import RunSummary, summary
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.skipping import Skip
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
@@ -22,7 +22,7 @@ from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
 from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import Source, skip_asked, source_of
+from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")

@@ -115,11 +115,11 @@ def compare_with(
         if new.scenario is None and old.scenario is None:
             which = "Log or truth"
         note = f"{which} differ: the trials are not the same"
-    found = []
+    comparisons = []
     for a, b in pairs:
         as_many = len(new.filters[a].runs) == len(old.filters[b].runs)
-        found.append(_compared(new, a, old, b, same, false_alarm, note, as_many or not new.trials))
-    return found
+        comparisons.append(_compared(new, a, old, b, same, false_alarm, note, as_many or not new.trials))
+    return comparisons
 
 
 def _numbered_alike(new: Baseline, old: Baseline) -> tuple[Baseline, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.referee.verdicts.sources import refused
+from consistency.referee.verdicts.judge_sources import refused
 
 
 def plan(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, stats
@@ -12,15 +12,14 @@ from consistency.bench.scenario.effects.node_tables import bilinear
 from consistency.referee.types import Array
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.likelihood import LikelihoodFit
-from consistency.stereo.characterising.log_residuals import FEW, Residuals
+from consistency.stereo.characterising.truth_residuals import FEW, Residuals
 
 GRID = (5, 4)  # nodes across and down
 TRACKS = 3  # that a node needs
 UNSURE = 5.0  # px, standard deviation of the prior that keeps a node without data from being singular
 
 
-@dataclass(frozen=True)
-class Grid:
+class Grid(NamedTuple):
     """Nodes of the image, and which have data; K across, L down."""
 
     u: Array  # (K,), px from the principal point
@@ -42,12 +41,13 @@ def grid_of(data: Residuals, u: Array, v: Array) -> Grid:
     """Nodes at ``u`` (K,) and ``v`` (L,), and what the data have around each."""
     weights = bilinear(data.ideal[:, 0], data.ideal[:, 1], u, v)
     rows = weights.sum(axis=0)
-    tracks = (np.add.reduceat(weights, data.first, axis=0) > 1.0).sum(axis=0) if len(data) else np.zeros(len(rows))
+    if not len(data):
+        return Grid(u, v, rows, np.zeros(len(rows), bool))
+    tracks = (np.add.reduceat(weights, data.first, axis=0) > 1.0).sum(axis=0)
     return Grid(u, v, rows, (rows >= FEW) & (tracks >= TRACKS))
 
 
-@dataclass(frozen=True)
-class BiasEstimate:
+class BiasEstimate(NamedTuple):
     """Bias of u, v, d at the nodes of a grid."""
 
     grid: Grid
@@ -59,10 +59,15 @@ class BiasEstimate:
 
     def matrix(self, k: int) -> Array:
         """What is believed of u, v or d, (L, K)."""
-        return np.asarray(self.believed[k].reshape(len(self.grid.v), len(self.grid.u)))
+        return self.believed[k].reshape(len(self.grid.v), len(self.grid.u))
 
 
-def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate: float) -> BiasEstimate:
+def estimate_bias(
+    fits: Sequence[LikelihoodFit],
+    grid: Grid,
+    level: float,
+    rate: float,
+) -> BiasEstimate:
     """Bias of each coordinate from its fit.
 
     Parameters
@@ -71,15 +76,19 @@ def estimate_bias(fits: Sequence[LikelihoodFit], grid: Grid, level: float, rate:
     rate : probability of finding a bias in a coordinate that has none
     """
     known = grid.known
-    value, half, believed = (np.full((3, len(known)), fill) for fill in (np.nan, np.nan, 0.0))
+    value = np.full((3, len(known)), np.nan)
+    half = np.full((3, len(known)), np.nan)
+    believed = np.zeros((3, len(known)))
     p_value = np.ones(3)
     for k, fit in enumerate(fits):
         beta, width, C = coordinate_fit.bias_coefficients(fit, level)
-        value[k, known], half[k, known] = beta[known], width[known]
+        value[k, known] = beta[known]
+        half[k, known] = width[known]
         if not known.any():
             continue
-        b, S = beta[known], C[np.ix_(known, known)]
-        p_value[k] = float(stats.chi2.sf(b @ np.linalg.solve(S, b), len(b)))
+        b = beta[known]
+        S = C[np.ix_(known, known)]
+        p_value[k] = stats.chi2.sf(b @ np.linalg.solve(S, b), len(b))
         if p_value[k] < rate:
             believed[k, known] = shrunken(b, S)
     return BiasEstimate(grid, value, half, p_value, p_value < rate, believed)
@@ -96,8 +105,10 @@ def shrunken(b: Array, S: Array) -> Array:
 
     def negative(log_w: float) -> float:
         variance = np.exp(2.0 * log_w) + values
-        return float(0.5 * (np.log(variance) + along**2 / variance).sum())
+        return 0.5 * (np.log(variance) + along**2 / variance).sum()
 
-    top = np.log(np.abs(b).max() + np.sqrt(values.max()) + 1e-9) + 1.0
-    w2 = np.exp(2.0 * optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded").x)
-    return np.asarray(axes @ (along * w2 / (w2 + values)))
+    largest = np.abs(b).max() + np.sqrt(values.max()) + 1e-9
+    top = np.log(largest) + 1.0
+    best = optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded")
+    w2 = np.exp(2.0 * best.x)
+    return axes @ (along * w2 / (w2 + values))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -16,11 +16,12 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.log_residuals import MAD, Residuals
+from consistency.stereo.characterising.truth_residuals import Residuals, robust_sd
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.sequence import SUFFIXES, read_image
 
-MODELS = ("full", "poor", "none")  # five coefficients, k1 alone, no distortion
+COEFFICIENTS = {"full": 5, "poor": 1, "none": 0}  # of distortion models: all, k1 alone, no distortion
+MODELS = tuple(COEFFICIENTS)
 FEWEST = 5  # pairs that a calibration of two cameras takes here
 Size = tuple[int, int]
 POSE = 6  # parameters of the pose of a board
@@ -31,8 +32,7 @@ NO_TIME = (
 )
 
 
-@dataclass(frozen=True)
-class Corners:
+class Corners(NamedTuple):
     """Inner corners of a board in both images of n pairs."""
 
     left: Array  # (n, c, 2), px
@@ -42,9 +42,13 @@ class Corners:
     missed: list[str]  # left images of pairs in which the board was not found
     image: Size  # width, height, px
 
+    @property
+    def points_of_pairs(self) -> list[Array]:
+        """The corners of the board, once for each pair, as OpenCV's calibrations take them."""
+        return [self.board.astype(np.float32)] * len(self.left)
 
-@dataclass(frozen=True)
-class Calibrated:
+
+class BoardCalibration(NamedTuple):
     """Corners of one calibration in rectified pixels."""
 
     model: str
@@ -73,36 +77,38 @@ def find_corners(folder: Path, board: Size, square: float) -> Corners:
     cv2 = opencv()
     pairs = pairs_of(folder)
     size = read_image(pairs[0][0]).shape[::-1]
-    found, names, missed = [], [], []
-    for pair in pairs:
-        left, right = (_corners(cv2, read_image(path, size), board) for path in pair)
+    lefts = []
+    rights = []
+    names = []
+    missed = []
+    for left_file, right_file in pairs:
+        left = _corners(cv2, read_image(left_file, size), board)
+        right = _corners(cv2, read_image(right_file, size), board)
         if left is None or right is None:
-            missed.append(pair[0].name)
+            missed.append(left_file.name)
             continue
         if (left[-1] - left[0]) @ (right[-1] - right[0]) < 0:  # a board looks the same when turned by 180 degrees
             right = right[::-1]
-        found.append((left, right))
-        names.append(pair[0].name)
-    if len(found) < FEWEST:
+        lefts.append(left)
+        rights.append(right)
+        names.append(left_file.name)
+    if len(names) < FEWEST:
         raise InputError(
-            f"{folder}: a board of {board[0]}x{board[1]} inner corners is in {len(found)} of {len(pairs)} pairs; at "
+            f"{folder}: a board of {board[0]}x{board[1]} inner corners is in {len(names)} of {len(pairs)} pairs; at "
             f"least {FEWEST} are needed: is --board right, and the whole board in both images?"
         )
-    across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
+    down, across = np.indices(board[::-1])
     points = square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
-    lefts, rights = (np.array(side, float) for side in zip(*found, strict=True))
-    return Corners(lefts, rights, points, names, missed, (int(size[0]), int(size[1])))
+    width, height = size
+    return Corners(np.array(lefts), np.array(rights), points, names, missed, (width, height))
 
 
 def pairs_of(folder: Path) -> list[tuple[Path, Path]]:
     """Images ``leftN`` and ``rightN`` of a folder, in order of N."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of images")
-    sides: list[dict[int, Path]] = []
-    for side in ("left", "right"):
-        files = {path: re.fullmatch(rf"{side}[-_]?(\d+)", path.stem.lower()) for path in folder.iterdir()}
-        sides.append({int(m[1]): path for path, m in files.items() if m and path.suffix.lower() in SUFFIXES})
-    left, right = sides
+    left = _numbered(folder, "left")
+    right = _numbered(folder, "right")
     if not left and not right:
         raise InputError(f"{folder}: holds no images leftN and rightN, such as left1.png and right1.png")
     if lonely := sorted(set(left) ^ set(right)):
@@ -113,45 +119,85 @@ def pairs_of(folder: Path) -> list[tuple[Path, Path]]:
     return [(left[number], right[number]) for number in sorted(left)]
 
 
+def _numbered(folder: Path, side: str) -> dict[int, Path]:
+    """Images of a folder whose name is ``side`` and a number, by the number."""
+    found = {}
+    for path in folder.iterdir():
+        match = re.fullmatch(rf"{side}[-_]?(\d+)", path.stem.lower())
+        if match and path.suffix.lower() in SUFFIXES:
+            found[int(match[1])] = path
+    return found
+
+
 def _corners(cv2: Any, image: Array, board: Size) -> Array | None:
     """Corners (c, 2) of a board, or None."""
     flags = cv2.CALIB_CB_ACCURACY  # normalising the image doubles the errors of corners in JPEG files
     good, corners = cv2.findChessboardCornersSB(image, board, flags=flags)
-    return np.asarray(corners, float).reshape(-1, 2) if good else None
+    if not good:
+        return None
+    return np.asarray(corners, float).reshape(-1, 2)
 
 
-def calibrate(corners: Corners, model: str) -> Calibrated:
+def calibrate(corners: Corners, model: str) -> BoardCalibration:
     """Calibrate with a distortion model and bring the corners to rectified pixels.
 
     Each camera is calibrated by itself, then both together with these held (OpenCV's ``stereoCalibrate``).
     """
     cv2 = opencv()
-    flags = {"full": 0, "poor": cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3}
-    flags["none"] = flags["poor"] | cv2.CALIB_FIX_K1
-    points = [corners.board.astype(np.float32)] * len(corners.left)
-    sides = [[c.astype(np.float32) for c in side] for side in (corners.left, corners.right)]
-    cameras = [cv2.calibrateCamera(points, side, corners.image, None, None, flags=flags[model]) for side in sides]
-    (rms_left, K1, D1, *_), (rms_right, K2, D2, *_) = cameras
-    both = cv2.stereoCalibrate(points, *sides, K1, D1, K2, D2, corners.image, flags=cv2.CALIB_FIX_INTRINSIC)
-    R, T = both[5], both[6]
+    K1, D1, rms_left = _calibrate_camera(cv2, corners, corners.left, model)
+    K2, D2, rms_right = _calibrate_camera(cv2, corners, corners.right, model)
+    rms_both, *_, R, T, _, _ = cv2.stereoCalibrate(
+        corners.points_of_pairs,
+        list(corners.left.astype(np.float32)),
+        list(corners.right.astype(np.float32)),
+        K1, D1, K2, D2,
+        corners.image,
+        flags=cv2.CALIB_FIX_INTRINSIC,
+    )  # fmt: skip
     R1, R2, P1, P2, *_ = cv2.stereoRectify(
         K1, D1, K2, D2, corners.image, R, T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0
     )
-    left, right = (
-        np.array([cv2.undistortPoints(c[:, None], K, D, R=turn, P=P)[:, 0] for c in side], float)
-        for side, K, D, turn, P in ((corners.left, K1, D1, R1, P1), (corners.right, K2, D2, R2, P2))
-    )
+    left = _rectified(cv2, corners.left, K1, D1, R1, P1)
+    right = _rectified(cv2, corners.right, K2, D2, R2, P2)
     centre = P1[:2, 2]
-    z = np.concatenate([left - centre, (left - right)[..., :1]], axis=-1)
-    coefficients = {"full": 5, "poor": 1, "none": 0}[model]
-    return Calibrated(
-        model, z, left[..., 1] - right[..., 1], float(P1[0, 0]), float(-P2[0, 3] / P2[0, 0]),
-        (float(centre[0]), float(centre[1])), (float(rms_left), float(rms_right), float(both[0])),
-        2 * (4 + coefficients) + 6,
-    )  # fmt: skip
+    return BoardCalibration(
+        model,
+        z=np.concatenate([left - centre, (left - right)[..., :1]], axis=-1),
+        rows=left[..., 1] - right[..., 1],
+        f=float(P1[0, 0]),
+        B=float(-P2[0, 3] / P2[0, 0]),
+        centre=(float(centre[0]), float(centre[1])),
+        rms=(float(rms_left), float(rms_right), float(rms_both)),
+        fitted=2 * (4 + COEFFICIENTS[model]) + 6,
+    )
 
 
-def characterise_board(folder: Path, board: Size, square: float, model: str, grid: Size) -> Characterisation:
+def _calibrate_camera(cv2: Any, corners: Corners, side: Array, model: str) -> tuple[Array, Array, float]:
+    """Matrix and distortion of one camera, and the rms of the fit in px."""
+    flags = 0
+    if model != "full":
+        flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    if model == "none":
+        flags |= cv2.CALIB_FIX_K1
+    rms, K, D, *_ = cv2.calibrateCamera(
+        corners.points_of_pairs, list(side.astype(np.float32)), corners.image, None, None, flags=flags
+    )
+    return K, D, rms
+
+
+def _rectified(cv2: Any, side: Array, K: Array, D: Array, turn: Array, P: Array) -> Array:
+    """Pixels (n, c, 2) of one camera after its rectification."""
+    flat = cv2.undistortPoints(side.reshape(-1, 1, 2), K, D, R=turn, P=P)
+    return flat.reshape(side.shape)
+
+
+def characterise_board(
+    folder: Path,
+    board: Size,
+    square: float,
+    model: str,
+    grid: Size,
+) -> Characterisation:
     """The noise of corners with one distortion model, the others beside it in the notes.
 
     Raises
@@ -162,85 +208,113 @@ def characterise_board(folder: Path, board: Size, square: float, model: str, gri
     if model not in MODELS:
         raise InputError(f"--distortion {model}: must be one of {', '.join(MODELS)}")
     corners = find_corners(folder, board, square)
+    notes = []
+    if corners.missed:
+        pairs = len(corners.names) + len(corners.missed)
+        names = ", ".join(corners.missed)
+        notes.append(
+            f"The board was not found in {len(corners.missed)} of {pairs} pairs ({names}); the others are used."
+        )
     results = {name: of_model(corners, name, str(folder), grid) for name in MODELS}
-    chosen = results[model]
-    pairs, names = len(corners.names) + len(corners.missed), ", ".join(corners.missed)
-    found = f"The board was not found in {len(corners.missed)} of {pairs} pairs ({names}); the others are used."
-    beside = tuple(_line(name, of) for name, of in results.items())
-    return replace(chosen, notes=((found,) if corners.missed else ()) + beside + NO_TIME)
+    for name, of in results.items():
+        notes.append(_line(name, of))
+    return replace(results[model], notes=(*notes, *NO_TIME))
 
 
-def of_model(corners: Corners, model: str, source: str, grid: Size) -> Characterisation:
+def of_model(
+    corners: Corners,
+    model: str,
+    source: str,
+    grid: Size,
+) -> Characterisation:
     """What is known of the corners with one distortion model."""
     calibrated = calibrate(corners, model)
     data = residuals_about_boards(calibrated, corners.board)
     sensor = PicturedSensor(
-        model="uvd", sigma=(1.0, 1.0, 1.0), f=calibrated.f, B=calibrated.B, image=corners.image,
+        model="uvd",
+        sigma=(1.0, 1.0, 1.0),
+        f=calibrated.f,
+        B=calibrated.B,
+        image=corners.image,
         principal_point=calibrated.centre,
-    )  # fmt: skip
+    )
     # the nodes of the map lie where corners are: boards do not reach the edges of the image
     where = sensor.model_copy(update={"image": None, "principal_point": None})
     of = characterise(data, where, f"{source}, distortion model '{model}'", grid=grid, alone=True)
-    rows = calibrated.rows
-    spread = MAD * float(np.median(np.abs(rows - np.median(rows))))
-    rms = ", ".join(f"{value:.2f}" for value in calibrated.rms)
-    text = f"calibration rms {rms} px; v_left - v_right robust sd {spread:.2f} px"
+    spread = robust_sd(calibrated.rows)
+    left, right, both = calibrated.rms
+    text = f"calibration rms {left:.2f}, {right:.2f}, {both:.2f} px; v_left - v_right robust sd {spread:.2f} px"
     return replace(of, sensor=sensor, notes=(text,))
 
 
 def _line(model: str, of: Characterisation) -> str:
-    sigma = " ".join(f"{c.name} {c.sigma.value:.3f}" for c in of.coordinates)
     assert of.bias is not None
     known = of.bias.believed[:, of.bias.grid.known]
-    widest = " ".join(f"{c.name} {np.abs(b).max():.2f}" for c, b in zip(of.coordinates, known, strict=True))
-    pooled = " ".join(f"{c.name} {c.pooled:.3f}" for c in of.coordinates)
+    sigma = []
+    widest = []
+    pooled = []
+    for c, bias in zip(of.coordinates, known, strict=True):
+        sigma.append(f"{c.name} {c.sigma.value:.3f}")
+        widest.append(f"{c.name} {np.abs(bias).max():.2f}")
+        pooled.append(f"{c.name} {c.pooled:.3f}")
     return (
-        f"Distortion model '{model}': noise {sigma} px, largest bias shown {widest} px, both together {pooled} px; "
-        f"{of.notes[0]}."
+        f"Distortion model '{model}': noise {' '.join(sigma)} px, largest bias shown {' '.join(widest)} px, both "
+        f"together {' '.join(pooled)} px; {of.notes[0]}."
     )
 
 
-def residuals_about_boards(calibrated: Calibrated, board: Array) -> Residuals:
+def residuals_about_boards(calibrated: BoardCalibration, board: Array) -> Residuals:
     """Residuals of corners about a board whose pose is fitted in each pair.
 
     The six parameters of each pose, and those of the calibration, are paid for: residuals are as large as they would
     be about the truth, on average.
     """
-    z, sigma = calibrated.z, np.ones(3)
+    z = calibrated.z
+    sigma = np.ones(3)
     n, count = z.shape[:2]
     poses = [_first_pose(pair, board, calibrated) for pair in z]
     ideal = np.empty_like(z)
     for _ in range(ROUNDS):
         for k, pair in enumerate(z):
             poses[k], ideal[k] = _fitted(pair, board, calibrated, poses[k], sigma)
-        sigma = np.maximum(np.sqrt(np.mean((z - ideal) ** 2, axis=(0, 1))), 1e-6)
+        rms = np.sqrt(np.mean((z - ideal) ** 2, axis=(0, 1)))
+        sigma = np.maximum(rms, 1e-6)
     paid = 1.0 - (POSE * n + calibrated.fitted) / (3.0 * n * count)
     r = (z - ideal) / np.sqrt(paid)
     track = np.repeat(np.arange(n), count)
     step = np.tile(np.arange(count), n)
-    return Residuals(r.reshape(-1, 3), ideal.reshape(-1, 3), track, step, np.zeros(n * count, bool))
+    moving = np.zeros(n * count, bool)
+    return Residuals(r.reshape(-1, 3), ideal.reshape(-1, 3), track, step, moving)
 
 
-def _project(pose: Array, board: Array, calibrated: Calibrated) -> Array:
+def _project(pose: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """Ideal (u, v, d) (c, 3) of a board; the pose is a rotation vector and a place in m, sensor axes."""
     points = Rotation.from_rotvec(pose[:3]).apply(board) + pose[3:]
     x, y, w = points.T
     return np.stack(stereo.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
 
 
-def _first_pose(z: Array, board: Array, calibrated: Calibrated) -> Array:
+def _first_pose(z: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """The pose that lays the board best on the triangulated corners, Arun et al. (1987)."""
     u, v, d = z.T
     seen = np.stack(stereo.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
-    turn, _ = Rotation.align_vectors(seen - seen.mean(axis=0), board - board.mean(axis=0))
-    return np.concatenate([turn.as_rotvec(), seen.mean(axis=0) - turn.apply(board.mean(axis=0))])
+    middle = seen.mean(axis=0)
+    middle_of_board = board.mean(axis=0)
+    turn, _ = Rotation.align_vectors(seen - middle, board - middle_of_board)
+    return np.concatenate([turn.as_rotvec(), middle - turn.apply(middle_of_board)])
 
 
-def _fitted(z: Array, board: Array, calibrated: Calibrated, start: Array, sigma: Array) -> tuple[Array, Array]:
+def _fitted(
+    z: Array,
+    board: Array,
+    calibrated: BoardCalibration,
+    start: Array,
+    sigma: Array,
+) -> tuple[Array, Array]:
     """Pose (6,) of the board by weighted least squares, and the ideal corners (c, 3)."""
 
     def misfit(pose: Array) -> Array:
-        return np.asarray(((z - _project(pose, board, calibrated)) / sigma).ravel())
+        return ((z - _project(pose, board, calibrated)) / sigma).ravel()
 
     best = optimize.least_squares(misfit, start, x_scale="jac")
     return best.x, _project(best.x, board, calibrated)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,13 @@ from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias_map import GRID, BiasEstimate, estimate_bias, grid_of
 from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.log_residuals import Residuals, RowSelection, octaves, select
+from consistency.stereo.characterising.truth_residuals import Residuals, octaves, select
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # probability that any interval misses
 LEAST = 100  # rows from which a noise can be told
 LEAST_TRACKS = 5
+SHORTEST = 1.5  # rows of a track in the mean, from which offset and correlation can be told
 
 
 @dataclass(frozen=True)
@@ -43,18 +45,19 @@ class Coordinate:
     @property
     def white(self) -> bool | None:
         """Whether no correlation is shown; None where it cannot be told."""
-        return None if self.correlation is None else self.correlation.holds(0.0)
+        if self.correlation is None:
+            return None
+        return self.correlation.holds(0.0)
 
     @property
     def offset_px(self) -> float:
         """Standard deviation of the offsets of tracks, px."""
         if self.offset is None:
             return float("nan")
-        return float(self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12)))
+        return self.sigma.value * np.sqrt(self.offset.value / max(1.0 - self.offset.value, 1e-12))
 
 
-@dataclass(frozen=True)
-class DisparityNoise:
+class DisparityNoise(NamedTuple):
     """Standard deviation of disparity by disparity."""
 
     nodes: Array  # (m,), px
@@ -111,70 +114,89 @@ def characterise(
     nodes_of_map = _nodes(data, sensor, grid)
     chosen = select(data, sensor, grid_of(data, *nodes_of_map).regressors(data))
     kept = chosen.kept
-    tracks = len(kept.first) if len(kept) else 0
+    tracks = len(np.unique(kept.track))
     if len(kept) < LEAST or tracks < LEAST_TRACKS:
         raise InputError(
             f"{source}: {len(kept)} observations of {tracks} tracks are left of {len(data)}; a noise takes at least "
             f"{LEAST} of {LEAST_TRACKS}: record more"
         )
     cells = grid_of(kept, *nodes_of_map)
+    X = cells.regressors(kept)
+
+    def fitted(k: int, G: Array) -> LikelihoodFit:
+        rows = Rows(kept.r[:, k], X, G, kept.first, kept.gap, cells.ridge)
+        try:
+            return fit(rows, chosen.rough[k], memory=rows.length >= SHORTEST and not alone)
+        except ValueError as error:
+            raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
+
+    one_noise = np.ones((len(kept), 1))
+    fits = [fitted(0, one_noise), fitted(1, one_noise), fitted(2, one_noise)]
     nodes = octaves(kept.ideal[:, 2])
     levels = Levels(miss, growth=len(nodes), bias=3 * int(cells.known.sum()))
-    X = cells.regressors(kept)
-    fits = [_fitted(kept, k, X, cells.ridge, np.ones((len(kept), 1)), chosen, source, alone) for k in range(3)]
     growth = None
     if len(nodes) > 1:
-        by_disparity = _fitted(kept, 2, X, cells.ridge, hats(kept.ideal[:, 2], nodes), chosen, source, alone)
+        by_disparity = fitted(2, hats(kept.ideal[:, 2], nodes))
         p_value = coordinate_fit.growth_p_value(by_disparity)
-        shown = p_value < levels.rate / 6
-        growth = DisparityNoise(
-            nodes, tuple(coordinate_fit.at_nodes(by_disparity, levels.of("growth"))), p_value, shown
-        )
-        fits[2] = by_disparity if shown else fits[2]
-    u, v, d = (_coordinate(k, each, kept, levels, alone) for k, each in enumerate(fits))
+        intervals = coordinate_fit.at_nodes(by_disparity, levels.of("growth"))
+        growth = DisparityNoise(nodes, tuple(intervals), p_value, p_value < levels.rate / 6)
+        if growth.shown:
+            fits[2] = by_disparity
+    u, v, d = (_coordinate(k, each, levels) for k, each in enumerate(fits))
+    residuals = np.column_stack([each.regression.residual for each in fits])
     return Characterisation(
-        sensor, source, (u, v, d), growth,
-        estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
-        rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")), tracks, len(kept),
-        {"near a limit of the sensor": chosen.at_limits, "grossly wrong": chosen.gross, "of no landmark": strange},
-        levels, kept,
-        ratio=moving_over_rest(np.column_stack([f.regression.residual for f in fits]), np.ones((len(kept), 3)),
-                               kept.moving, kept.track, levels.of("sigma")),
-    )  # fmt: skip
+        sensor,
+        source,
+        coordinates=(u, v, d),
+        growth=growth,
+        bias=estimate_bias(fits, cells, levels.of("bias"), levels.rate / 18),
+        gross=rate(chosen.gross, len(kept) + chosen.gross, levels.of("tails")),
+        tracks=tracks,
+        rows=len(kept),
+        left_out={
+            "near a limit of the sensor": chosen.at_limits,
+            "grossly wrong": chosen.gross,
+            "of no landmark": strange,
+        },
+        level=levels,
+        kept=kept,
+        ratio=moving_over_rest(residuals, np.ones_like(residuals), kept.moving, kept.track, levels.of("sigma")),
+    )
 
 
 def _nodes(data: Residuals, sensor: PicturedSensor, grid: tuple[int, int]) -> tuple[Array, Array]:
     """Nodes of the bias map, evenly from edge to edge of the image, or of the data where no image is known."""
     if sensor.image is None:
-        edges = [np.quantile(data.ideal[:, k], [0.01, 0.99]) for k in range(2)]
+        low, high = np.quantile(data.ideal[:, :2], [0.01, 0.99], axis=0)
     else:
-        edges = [np.array([-middle, size - middle]) for size, middle in zip(sensor.image, sensor.centre, strict=True)]
-    u, v = (np.linspace(low, high, count) for (low, high), count in zip(edges, grid, strict=True))
-    return u, v
+        low = -np.array(sensor.centre)
+        high = np.array(sensor.image) - sensor.centre
+    across, down = grid
+    return np.linspace(low[0], high[0], across), np.linspace(low[1], high[1], down)
 
 
-def _fitted(
-    data: Residuals, k: int, X: Array, ridge: Array, G: Array, chosen: RowSelection, source: str, alone: bool
-) -> LikelihoodFit:
-    """The fit of coordinate ``k``; nodes without any data are not parameters."""
-    rows = Rows(data.r[:, k], X, G, data.first, data.gap, ridge)
-    try:
-        return fit(rows, float(chosen.rough[k]), memory=rows.length >= 1.5 and not alone)
-    except ValueError as error:
-        raise InputError(f"{source}: {error} of {NAMES[k]}; record more or longer tracks") from None
-
-
-def _coordinate(k: int, of: LikelihoodFit, kept: Residuals, levels: Levels, alone: bool) -> Coordinate:
-    r, rows = kept.r[:, k], of.rows
-    n = np.diff(np.append(rows.first, len(r)))
-    centred = r - (np.add.reduceat(r, rows.first) / n)[rows.track]
+def _coordinate(k: int, of: LikelihoodFit, levels: Levels) -> Coordinate:
+    r = of.rows.r
+    track = of.rows.track
+    n = np.bincount(track)
+    centred = r - (np.bincount(track, r) / n)[track]
+    spare = max(len(r) - len(n), 1)
+    correlation = None
+    offset = None
+    if of.memory:
+        correlation = coordinate_fit.correlation(of, levels.of("correlation"))
+        offset = coordinate_fit.offset_share(of, levels.of("offset"))
     lags, bounds = coordinate_fit.autocorrelation(of)
-    memory = rows.length >= 1.5 and not alone
     w = of.regression.residual
     return Coordinate(
-        NAMES[k], coordinate_fit.noise_interval(of, levels.of("sigma")), float(r.std(ddof=1)),
-        float(np.sqrt((centred**2).sum() / max(len(r) - len(n), 1))),
-        coordinate_fit.correlation(of, levels.of("correlation")) if memory else None,
-        coordinate_fit.offset_share(of, levels.of("offset")) if memory else None,
-        tails(w, levels.of("tails")), lags, bounds, w / w.std(),
-    )  # fmt: skip
+        NAMES[k],
+        sigma=coordinate_fit.noise_interval(of, levels.of("sigma")),
+        pooled=r.std(ddof=1),
+        about_tracks=np.sqrt((centred**2).sum() / spare),
+        correlation=correlation,
+        offset=offset,
+        tails=tails(w, levels.of("tails")),
+        lags=lags,
+        bounds=bounds,
+        residuals=w / w.std(),
+    )

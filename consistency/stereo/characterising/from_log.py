@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Mount, PicturedSensor, read_table
-from consistency.bench.store.log import Log, SensorFile, read_log, table_file
+from consistency.bench.store.recorded_log import Log, SensorFile, read_log, table_file
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
-from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.log_residuals import residuals_of
-from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
+from consistency.stereo.characterising.fitted_tracks import characterise_posed
+from consistency.stereo.characterising.point_fit import SHORTEST, Sightings
+from consistency.stereo.characterising.truth_residuals import moved_before, residuals_of
+from consistency.stereo.frontend.camera_truth import tum_poses
 from consistency.stereo.frontend.planar_log import CAMERA
 
 OTHERS = ("motion", "start", "sigma_points")  # tables that a measured sensor keeps from the log
@@ -50,12 +50,11 @@ class SourceOptions:
 
     def of_images(self) -> list[str]:
         """Options that are given and mean nothing for a log."""
-        names = ("calibration", "truth", "format", "left", "right", "board", "square", "distortion", "seed")
-        return [f"--{name}" for name in names if getattr(self, name) is not None]
+        both = ("grid", "at_rest", "free_poses")
+        return [f"--{name}" for name, value in vars(self).items() if name not in both and value is not None]
 
 
-@dataclass(frozen=True)
-class Measured:
+class MeasuredSensor(NamedTuple):
     """A characterisation and what of the source's file stays as it was."""
 
     of: Characterisation
@@ -67,7 +66,12 @@ def is_log(folder: Path) -> bool:
     return any(table_file(folder, name).exists() for name in ("observations", "controls"))
 
 
-def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False, free_poses: bool = False) -> Measured:
+def characterise_log(
+    folder: Path,
+    grid: tuple[int, int],
+    at_rest: bool = False,
+    free_poses: bool = False,
+) -> MeasuredSensor:
     """The sensor of a log folder.
 
     With true poses and landmarks everything is estimated; with true poses alone no bias map and no offsets; without
@@ -86,27 +90,35 @@ def characterise_log(folder: Path, grid: tuple[int, int], at_rest: bool = False,
     sensor = PicturedSensor.model_validate(file.model_dump(include=set(PicturedSensor.model_fields)))
     dumped = file.model_dump(exclude_none=True)
     others: dict[str, Any] = {key: value for key, value in dumped.items() if key in OTHERS}
-    return Measured(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
+    return MeasuredSensor(_of_log(log, sensor, str(folder), grid, at_rest, free_poses), others)
 
 
 def _of_log(
-    log: Log, sensor: PicturedSensor, source: str, grid: tuple[int, int], at_rest: bool, free_poses: bool
+    log: Log,
+    sensor: PicturedSensor,
+    source: str,
+    grid: tuple[int, int],
+    at_rest: bool,
+    free_poses: bool,
 ) -> Characterisation:
-    poses = all(trial.truth is not None for trial in log.trials)
-    if poses and not at_rest and not free_poses and all(trial.landmarks is not None for trial in log.trials):
-        data, strange = residuals_of(log.trials, sensor)
+    trials = log.trials
+    poses = all(trial.truth is not None for trial in trials)
+    landmarks = all(trial.landmarks is not None for trial in trials)
+    if poses and landmarks and not at_rest and not free_poses:
+        data, strange = residuals_of(trials, sensor)
         return characterise(data, sensor, source, strange, grid)
     space = Path(source) / SPACE
-    if not at_rest and len(log.trials) == 1 and space.is_file():
-        return characterise_posed(
-            _in_space(log.trials[0], space), sensor, source, (FREE if free_poses else EXACT,), free_poses
-        )
+    if not at_rest and len(trials) == 1 and space.is_file():
+        note = EXACT
+        if free_poses:
+            note = FREE
+        return characterise_posed(_in_space(trials[0], space), sensor, source, (note,), free_poses)
     if free_poses:
         raise InputError(f"{source}: --free-poses begins with poses in space, and there is no {SPACE} of one run")
     if poses and not at_rest:
-        return characterise_posed(seen_of(log.trials, sensor.mount), sensor, source, (EXACT, PLANE))
-    rests = [np.zeros(trial.steps, np.int64) if at_rest else _at_rest(trial) for trial in log.trials]
-    seen = seen_of(log.trials, sensor.mount, rests)
+        return characterise_posed(seen_of(trials, sensor.mount), sensor, source, (EXACT, PLANE))
+    rests = [_rests(trial, at_rest) for trial in trials]
+    seen = seen_of(trials, sensor.mount, rests)
     if len(seen.long_enough().z) == 0:
         raise InputError(
             f"{source}: has no truth.parquet and no landmark seen {SHORTEST} times at rest: while the robot moves, "
@@ -116,48 +128,55 @@ def _of_log(
     return characterise_posed(seen, sensor, source, (REST,))
 
 
-def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None = None) -> Seen:
+def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None = None) -> Sightings:
     """What is seen from true poses, or with ``rests`` (T,) of numbers of rests, in each of these from one pose.
 
     A landmark is a track of its own in each run, and in each rest; steps between rests have the number -1.
     """
-    parts, tracks = [], 0
+    parts = []
+    tracks = 0
     for number, trial in enumerate(trials):
-        step = trial.step
-        rest = np.zeros(trial.steps, np.int64) if rests is None else rests[number]
-        place = rest[step - 1]
-        track = trial.landmark + trial.n_landmarks * place
-        order = np.lexsort((step, track))
-        order = order[place[order] >= 0]
-        pose = np.zeros((trial.steps + 1, 3)) if trial.truth is None or rests is not None else trial.truth
+        rest = np.zeros(trial.steps, np.int64)
+        pose = np.zeros((trial.steps + 1, 3))
+        if rests is not None:
+            rest = rests[number]
+        elif trial.truth is not None:
+            pose = trial.truth
+        rest_of_row = rest[trial.step - 1]
+        track = trial.landmark + trial.n_landmarks * rest_of_row
+        order = np.lexsort((trial.step, track))
+        order = order[rest_of_row[order] >= 0]
+        step = trial.step[order]
         R, t = _sensor_poses(pose, mount)
-        moved = np.append(False, np.abs(np.diff(pose, axis=0)).max(axis=1) > 0.0)
-        rows = step[order]
-        parts.append((trial.z[order], R[rows], t[rows], tracks + track[order], rows, moved[rows]))
+        moving = moved_before(pose)
+        parts.append((trial.z[order], R[step], t[step], tracks + track[order], step, moving[step]))
         tracks += trial.n_landmarks * (int(rest.max()) + 1)
-    return Seen(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Sightings(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _in_space(trial: Trial, path: Path) -> Seen:
+def _in_space(trial: Trial, path: Path) -> Sightings:
     """What is seen from the true poses of the left camera in a file of TUM's form, a line for each of steps 0..T."""
-    lines = read_trajectory(path, true=True)
-    if len(lines.values) != trial.steps + 1:
-        raise InputError(f"{path}: {len(lines.values)} poses for steps 0 to {trial.steps}; must hold one for each")
-    turns, place = Rotation.from_quat(lines.values[:, 4:8]).as_matrix() @ CAMERA, lines.values[:, 1:4]
+    _, R, t = tum_poses(path)
+    if len(t) != trial.steps + 1:
+        raise InputError(f"{path}: {len(t)} poses for steps 0 to {trial.steps}; must hold one for each")
+    R = R @ CAMERA
     order = np.lexsort((trial.step, trial.landmark))
-    rows = trial.step[order]
-    return Seen(trial.z[order], turns[rows], place[rows], trial.landmark[order], rows, np.ones(len(rows), bool))
+    step = trial.step[order]
+    moving = np.ones(len(step), bool)
+    return Sightings(trial.z[order], R[step], t[step], trial.landmark[order], step, moving)
 
 
 def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:
     """Rotation (T + 1, 3, 3) and place (T + 1, 3) of the sensor in the world from poses on the plane."""
-    turns = np.stack([rotation(0.0, 0.0, float(heading)) for heading in pose[:, 2]])
-    place = np.column_stack([pose[:, :2], np.zeros(len(pose))])
+    turns = Rotation.from_euler("z", pose[:, 2:]).as_matrix()
+    place = np.pad(pose[:, :2], ((0, 0), (0, 1)))
     return turns @ rotation(*mount.rotation), place + turns @ np.array(mount.position)
 
 
-def _at_rest(trial: Trial) -> Array:
+def _rests(trial: Trial, always: bool) -> Array:
     """Number of the rest of each step (T,), -1 while the controls say that the robot moves."""
+    if always:
+        return np.zeros(trial.steps, np.int64)
     still = (trial.controls[:, 1:] == 0.0).all(axis=1)
     begins = still & ~np.append(False, still[:-1])
     return np.where(still, np.cumsum(begins) - 1, -1)

@@ -10,16 +10,17 @@ from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation
+from consistency.stereo.characterising.fitted_tracks import characterise_posed
 from consistency.stereo.characterising.from_log import EXACT, FREE, REST, SourceOptions
-from consistency.stereo.characterising.known_poses import characterise_posed
-from consistency.stereo.characterising.log_residuals import MAD
-from consistency.stereo.characterising.unknown_landmarks import SHORTEST, Seen
-from consistency.stereo.frontend.dataset_truth import find_truth, read_truth
+from consistency.stereo.characterising.point_fit import SHORTEST, Sightings
+from consistency.stereo.characterising.truth_residuals import robust_sd
+from consistency.stereo.frontend.camera_truth import find_truth, read_truth
 from consistency.stereo.frontend.planar_log import CAMERA, observations
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
-from consistency.stereo.visual_odometry.sequence import Sequence, read_sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence
+from consistency.stereo.visual_odometry.tracks import PIXELS
 
 CHOSEN = (
     "Tracks are matches on which a motion could be agreed: RANSAC's gate cuts off the largest errors before they are "
@@ -36,23 +37,29 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
         As :func:`consistency.vision.read_sequence`; too few pairs; neither at rest nor with true poses.
     """
     sequence = read_sequence(folder, options.calibration, options.format, options.left, options.right)
-    rig = sequence.rectification.rig
-    if not is_rectified(rig):
-        raise InputError(f"{sequence.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+    rig = sequence.uvd_rig
     if len(sequence) < SHORTEST:
         raise InputError(f"{folder}: holds {len(sequence)} stereo pairs; a noise takes at least {SHORTEST}")
     R, t = _poses(sequence, options)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed or 0))
     seen = _seen(rig, motions, R, t)
+    notes = []
+    if options.at_rest:
+        notes.append(REST)
     free = options.free_poses or options.at_rest
-    notes = (*((REST,) if options.at_rest else ()), FREE if free else EXACT, CHOSEN, rows_note(rig, motions))
-    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), notes, free)
+    if free:
+        notes.append(FREE)
+    else:
+        notes.append(EXACT)
+    notes += [CHOSEN, rows_note(rig, motions)]
+    return characterise_posed(seen, uncalibrated_noise_sensor(rig), str(folder), tuple(notes), free)
 
 
-def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
+def _poses(sequence: StereoSequence, options: SourceOptions) -> tuple[Array, Array]:
     """Poses (n, 3, 3), (n, 3) of the left camera; equal poses at rest."""
     if options.at_rest:
-        return np.broadcast_to(np.eye(3), (len(sequence), 3, 3)), np.zeros((len(sequence), 3))
+        n = len(sequence)
+        return np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
     path = options.truth or find_truth(sequence)
     if path is None:
         raise InputError(
@@ -65,27 +72,35 @@ def _poses(sequence: Sequence, options: SourceOptions) -> tuple[Array, Array]:
 def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
     """A sensor of which only the calibration is known; its noise is a placeholder."""
     return PicturedSensor(
-        model="uvd", sigma=(1.0, 1.0, 1.0), f=float(rig.K_left[0, 0]), B=float(rig.baseline), image=rig.image_size,
-        principal_point=(float(rig.K_left[0, 2]), float(rig.K_left[1, 2])),
-    )  # fmt: skip
+        model="uvd",
+        sigma=(1.0, 1.0, 1.0),
+        f=rig.f,
+        B=rig.baseline,
+        image=rig.image_size,
+        principal_point=rig.principal_point,
+    )
 
 
-def _seen(rig: StereoRig, motions: list[RelativeMotion], R: Array, t: Array) -> Seen:
-    rows = observations(rig, motions).sort_values(["piece", "step"])
+def _seen(
+    rig: StereoRig,
+    motions: list[RelativeMotion],
+    R: Array,
+    t: Array,
+) -> Sightings:
+    rows = observations(rig, motions)
+    rows = rows[rows["z2"] > 0]
     step = rows["step"].to_numpy(np.int64)
-    z = rows[["z0", "z1", "z2"]].to_numpy(float)
-    near = z[:, 2] > 0
-    moving = np.full(len(step), bool(np.ptp(t, axis=0).any()))
-    seen = Seen(z, (R @ CAMERA)[step], t[step], rows["piece"].to_numpy(np.int64), step, moving)
-    return seen.keep(near)
+    track = rows["piece"].to_numpy(np.int64)
+    moving = np.full(len(step), np.ptp(t, axis=0).any())
+    return Sightings(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
 
 
 def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:
     """A note on the rows of matches, which should be equal in both images."""
     pixels = np.concatenate([m.uv1[m.inliers] for m in motions])
-    gap = pixels[:, 1] - pixels[:, 3] - (rig.K_left[1, 2] - rig.K_right[1, 2])
-    spread = MAD * float(np.median(np.abs(gap - np.median(gap))))
+    _, v_left, _, v_right = pixels.T
+    gap = v_left - v_right - (rig.K_left[1, 2] - rig.K_right[1, 2])
     return (
         f"v_left - v_right of {len(gap)} matches: mean {gap.mean():+.3f} px, an error of the rectification; robust sd "
-        f"{spread:.3f} px."
+        f"{robust_sd(gap):.3f} px."
     )

@@ -7,8 +7,8 @@ maximise the likelihood of what the regression leaves, so that the degrees of fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -18,6 +18,7 @@ from consistency.referee.types import Array, Indices
 STEP = 1e-3  # of a parameter, for second differences; log sigma, atanh rho and log(1 + n q) are all of order 1
 MOST = 0.995  # magnitude of a correlation
 IMPOSSIBLE = 1e12
+UNDETERMINED = "the data do not determine the noise"
 GENTLE = 1e-3  # of the rows: slope at which the first search ends
 STEPS = 30
 NEAR = 1e-6  # squared distance to the top, in standard deviations
@@ -37,32 +38,24 @@ class Rows:
     @property
     def length(self) -> float:
         """Rows of a track that its offset is averaged over, the mean that an analysis of variance has."""
-        n = np.diff(np.append(self.first, len(self.r)))
-        return float((n.sum() - (n**2).sum() / n.sum()) / max(len(n) - 1, 1))
+        n = np.bincount(self.track)
+        return (len(self.r) - (n**2).sum() / len(self.r)) / max(len(n) - 1, 1)
 
     @property
     def track(self) -> Indices:
         """Number of the track of each row, (N,)."""
-        n = np.diff(np.append(self.first, len(self.r)))
-        return np.repeat(np.arange(len(n)), n)
+        return np.searchsorted(self.first, np.arange(len(self.r)), side="right") - 1
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """What a vector of unconstrained parameters stands for."""
+class Parameters(NamedTuple):
+    """Noise of one coordinate."""
 
     a: Array  # (m,), px, standard deviation of the noise at the nodes
     rho: float
     ratio: float  # q: variance of the offsets over that of the noise; may be a little below 0
 
-    @classmethod
-    def of(cls, theta: Array, length: float) -> Parameters:
-        """From log a, atanh rho, log(1 + length q): scales on which estimates are nearly Gaussian."""
-        return cls(np.exp(theta[:-2]), float(np.tanh(theta[-2])), float(np.expm1(theta[-1]) / length))
 
-
-@dataclass(frozen=True)
-class Whitened:
+class Whitened(NamedTuple):
     """Rows freed of their correlation, and what that costs in each track."""
 
     values: Array  # (N, columns)
@@ -74,28 +67,28 @@ def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
     sd = rows.G @ p.a
     if abs(p.rho) > MOST or not (sd > 0).all():
         return None
-    root = np.sqrt(np.mean(sd**2) * abs(p.ratio)) * np.sign(p.ratio)
+    root = np.sqrt(np.mean(sd**2) * abs(p.ratio))
     x = np.column_stack([columns, np.ones(len(sd))]) / sd[:, None]
     decay = np.where(rows.gap > 0, p.rho ** np.maximum(rows.gap, 1), 0.0)
     left = 1.0 - decay**2
     x[1:] -= decay[1:, None] * x[:-1]
     x /= np.sqrt(left)[:, None]
-    one = x[:, -1:] * abs(root)
-    energy = np.sign(root) * np.add.reduceat(one[:, 0] ** 2, rows.first)
+    one = x[:, -1:] * root
+    size = np.add.reduceat(one[:, 0] ** 2, rows.first)
+    energy = np.sign(p.ratio) * size
     if (energy <= -1.0).any():
         return None
-    log_variance = np.add.reduceat(2.0 * np.log(sd) + np.log(left), rows.first) + np.log1p(energy)
+    of_rows = 2.0 * np.log(sd) + np.log(left)
+    log_variance = np.add.reduceat(of_rows, rows.first) + np.log1p(energy)
     x = x[:, :-1]
-    if root != 0.0:  # (I - k c c')^2 is the inverse of I + s c c'
-        size = np.add.reduceat(one[:, 0] ** 2, rows.first)
+    if root > 0.0:  # (I - k c c')^2 is the inverse of I + s c c'
         k = (1.0 - 1.0 / np.sqrt(1.0 + energy)) / np.maximum(size, 1e-300)
         along = np.add.reduceat(one * x, rows.first, axis=0) * k[:, None]
         x -= one * along[rows.track]
     return Whitened(x, log_variance)
 
 
-@dataclass(frozen=True)
-class Regression:
+class Regression(NamedTuple):
     """Generalised least squares at some parameters."""
 
     beta: Array  # (p,)
@@ -110,7 +103,8 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
     white = whiten_rows(rows, np.column_stack([rows.r, rows.X]), p)
     if white is None:
         return None
-    y, X = white.values[:, 0], white.values[:, 1:]
+    y = white.values[:, 0]
+    X = white.values[:, 1:]
     normal = X.T @ X + np.diag(rows.ridge)
     try:
         factor = np.linalg.cholesky(normal)
@@ -118,12 +112,12 @@ def regress(rows: Rows, p: Parameters) -> Regression | None:
         return None
     beta = np.linalg.solve(normal, X.T @ y)
     e = y - X @ beta
-    value = -0.5 * (white.log_variance.sum() + 2.0 * np.log(np.diag(factor)).sum() + e @ e + rows.ridge @ beta**2)
-    return Regression(beta, np.linalg.inv(normal), e, X, float(value))
+    log_det = white.log_variance.sum() + 2.0 * np.log(np.diag(factor)).sum()
+    value = -0.5 * (log_det + e @ e + rows.ridge @ beta**2)
+    return Regression(beta, np.linalg.inv(normal), e, X, value)
 
 
-@dataclass(frozen=True)
-class LikelihoodFit:
+class LikelihoodFit(NamedTuple):
     """The largest restricted likelihood and what is known of its place."""
 
     rows: Rows
@@ -132,10 +126,48 @@ class LikelihoodFit:
     robust: Array  # (m + 2, m + 2), of theta by the scatter of the tracks' scores: right for any noise
     regression: Regression
     parameters: Parameters
+    memory: bool  # whether offset and correlation were estimated
 
     @property
     def tracks(self) -> int:
         return len(self.rows.first)
+
+
+class Likelihood(NamedTuple):
+    """Likelihood of rows over log a, atanh rho and log(1 + n q), on which estimates are nearly Gaussian."""
+
+    rows: Rows
+    memory: bool  # whether atanh rho and log(1 + n q) are parameters; if not, rho and q are 0
+
+    def parameters(self, x: Array) -> Parameters:
+        """The noise that ``x`` (k,) stands for."""
+        nodes = self.rows.G.shape[1]
+        if not self.memory:
+            return Parameters(np.exp(x), 0.0, 0.0)
+        rho = float(np.tanh(x[nodes]))
+        ratio = float(np.expm1(x[nodes + 1])) / max(self.rows.length, 1.0)
+        return Parameters(np.exp(x[:nodes]), rho, ratio)
+
+    def restricted(self, x: Array) -> float:
+        """Negative restricted log-likelihood."""
+        found = regress(self.rows, self.parameters(x))
+        if found is None:
+            return IMPOSSIBLE
+        return -found.value
+
+    def with_bias_held(self, x: Array, r: Array) -> float:
+        """Negative log-likelihood of residuals (N, 1) about a bias that is held, which costs much less."""
+        white = whiten_rows(self.rows, r, self.parameters(x))
+        if white is None:
+            return IMPOSSIBLE
+        return 0.5 * (white.log_variance.sum() + (white.values**2).sum())
+
+    def of_tracks(self, x: Array, r: Array) -> Array:
+        """Log-likelihood (K,) of the residuals (N, 1) of each track, likewise."""
+        white = whiten_rows(self.rows, r, self.parameters(x))
+        assert white is not None
+        squares = np.add.reduceat(white.values[:, 0] ** 2, self.rows.first)
+        return -0.5 * (white.log_variance + squares)
 
 
 def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
@@ -151,93 +183,90 @@ def fit(rows: Rows, start: float, memory: bool = True) -> LikelihoodFit:
     ValueError
         The rows do not determine the parameters.
     """
-    m, length = rows.G.shape[1], max(rows.length, 1.0)
-    free = np.arange(m + 2 if memory else m)
-    theta = np.concatenate([np.full(m, np.log(start)), [0.0, 0.0]])
-
-    def full(values: Array) -> Array:
-        out = theta.copy()
-        out[free] = values
-        return out
-
-    def restricted(values: Array) -> float:
-        found = regress(rows, Parameters.of(full(values), length))
-        return IMPOSSIBLE if found is None else -found.value
-
-    x = np.asarray(theta[free])
-    plain = rows.X @ np.linalg.solve(rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9), rows.X.T @ rows.r)
-    x = optimize.minimize(_held(rows, plain, full, length), x, method="BFGS", options={"gtol": GENTLE * len(rows.r)}).x
-    x, H = _climb(restricted, x, rows, full, length)
-    theta = full(x)
-    parameters = Parameters.of(theta, length)
-    regression = regress(rows, parameters)
+    likelihood = Likelihood(rows, memory)
+    nodes = rows.G.shape[1]
+    x = np.full(nodes, np.log(start))
+    if memory:
+        x = np.append(x, [0.0, 0.0])
+    normal = rows.X.T @ rows.X + np.diag(rows.ridge + 1e-9)
+    about_plain = (rows.r - rows.X @ np.linalg.solve(normal, rows.X.T @ rows.r))[:, None]
+    first = optimize.minimize(
+        likelihood.with_bias_held,
+        x,
+        args=(about_plain,),
+        method="BFGS",
+        options={"gtol": GENTLE * len(rows.r)},
+    )
+    x, H = _climb(likelihood, first.x)
+    regression = regress(rows, likelihood.parameters(x))
     if regression is None:
-        raise ValueError("the data do not determine the noise")
+        raise ValueError(UNDETERMINED)
     inverse = np.linalg.inv(H)
-    scores = _scores(rows, full, x, regression.beta, length)
+    scores = _scores(likelihood, x, regression.beta)
     K = len(scores)
     robust = inverse @ (scores.T @ scores) @ inverse * K / max(K - 1, 1)
-    cov, scatter = np.zeros((m + 2, m + 2)), np.zeros((m + 2, m + 2))
-    cov[np.ix_(free, free)], scatter[np.ix_(free, free)] = inverse, robust
-    return LikelihoodFit(rows, theta, cov, scatter, regression, parameters)
+    missing = nodes + 2 - len(x)
+    return LikelihoodFit(
+        rows,
+        theta=np.pad(x, (0, missing)),
+        cov=np.pad(inverse, (0, missing)),
+        robust=np.pad(robust, (0, missing)),
+        regression=regression,
+        parameters=likelihood.parameters(x),
+        memory=memory,
+    )
 
 
-def _held(rows: Rows, bias: Array, full: Callable[[Array], Array], length: float) -> Callable[[Array], float]:
-    """Negative log-likelihood of the free parameters with the bias (N,) held, much cheaper than the restricted one."""
-    y = (rows.r - bias)[:, None]
-
-    def negative(values: Array) -> float:
-        white = whiten_rows(rows, y, Parameters.of(full(values), length))
-        return IMPOSSIBLE if white is None else 0.5 * float(white.log_variance.sum() + (white.values**2).sum())
-
-    return negative
-
-
-def _climb(
-    restricted: Callable[[Array], float], x: Array, rows: Rows, full: Callable[[Array], Array], length: float
-) -> tuple[Array, Array]:
-    """Newton's steps to the least ``restricted``, and the curvature there.
+def _climb(likelihood: Likelihood, x: Array) -> tuple[Array, Array]:
+    """Newton's steps to the largest restricted likelihood, and the curvature there.
 
     The curvature is that with the bias held: its residuals have lost already the degrees of freedom that it costs.
     """
-    e = STEP * np.eye(len(x))
+    rows = likelihood.rows
     for _ in range(STEPS):
-        found = regress(rows, Parameters.of(full(x), length))
+        found = regress(rows, likelihood.parameters(x))
         if found is None:
-            raise ValueError("the data do not determine the noise")
-        H = numerical_hessian(_held(rows, rows.X @ found.beta, full, length), x)
+            raise ValueError(UNDETERMINED)
+        H = _curvature(likelihood, x, found.beta)
         if not np.isfinite(H).all() or np.linalg.eigvalsh(H)[0] <= 0:
-            raise ValueError("the data do not determine the noise")
-        slope = np.array([(restricted(x + d) - restricted(x - d)) / (2.0 * STEP) for d in e])
-        step, size = -np.linalg.solve(H, slope), 1.0
+            raise ValueError(UNDETERMINED)
+        slope = np.empty(len(x))
+        for i, d in enumerate(STEP * np.eye(len(x))):
+            up = likelihood.restricted(x + d)
+            down = likelihood.restricted(x - d)
+            slope[i] = (up - down) / (2.0 * STEP)
+        step = -np.linalg.solve(H, slope)
         if slope @ -step < NEAR:
             return x, H
-        while restricted(x + size * step) > -found.value and size > 1e-3:
+        size = 1.0
+        while likelihood.restricted(x + size * step) > -found.value and size > 1e-3:
             size *= 0.5
         x = x + size * step
     return x, H
 
 
-def numerical_hessian(objective: Callable[[Array], float], x: Array) -> Array:
-    """Second derivatives (k, k) by central differences."""
-    k, e = len(x), STEP * np.eye(len(x))
-    H = np.empty((k, k))
-    for i in range(k):
-        for j in range(i + 1):
-            values = [objective(x + s * e[i] + t * e[j]) for s, t in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-            H[i, j] = H[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * STEP**2)
+def _curvature(likelihood: Likelihood, x: Array, beta: Array) -> Array:
+    """Second derivatives (k, k) of the negative log-likelihood, by central differences."""
+    r = (likelihood.rows.r - likelihood.rows.X @ beta)[:, None]
+    e = STEP * np.eye(len(x))
+    H = np.empty((len(x), len(x)))
+    for i, j in zip(*np.tril_indices(len(x)), strict=True):
+        both_up = likelihood.with_bias_held(x + e[i] + e[j], r)
+        one_up = likelihood.with_bias_held(x + e[i] - e[j], r)
+        other_up = likelihood.with_bias_held(x - e[i] + e[j], r)
+        both_down = likelihood.with_bias_held(x - e[i] - e[j], r)
+        H[i, j] = (both_up - one_up - other_up + both_down) / (4.0 * STEP**2)
+        H[j, i] = H[i, j]
     return H
 
 
-def _scores(rows: Rows, full: Callable[[Array], Array], x: Array, beta: Array, length: float) -> Array:
+def _scores(likelihood: Likelihood, x: Array, beta: Array) -> Array:
     """Derivative of each track's log-likelihood by each parameter, (K, k), with the bias held."""
-    y = (rows.r - rows.X @ beta)[:, None]
-
-    def by_track(values: Array) -> Array:
-        white = whiten_rows(rows, y, Parameters.of(full(values), length))
-        assert white is not None
-        return -0.5 * (white.log_variance + np.add.reduceat(white.values[:, 0] ** 2, rows.first))
-
-    columns = [(by_track(x + d) - by_track(x - d)) / (2.0 * STEP) for d in STEP * np.eye(len(x))]
-    scores = np.column_stack(columns)
-    return np.asarray(scores - scores.mean(axis=0))
+    rows = likelihood.rows
+    r = (rows.r - rows.X @ beta)[:, None]
+    scores = np.empty((len(rows.first), len(x)))
+    for i, d in enumerate(STEP * np.eye(len(x))):
+        up = likelihood.of_tracks(x + d, r)
+        down = likelihood.of_tracks(x - d, r)
+        scores[:, i] = (up - down) / (2.0 * STEP)
+    return scores - scores.mean(axis=0)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising.bias_map import GRID
-from consistency.stereo.characterising.from_log import Measured, SourceOptions, characterise_log, is_log
+from consistency.stereo.characterising.from_log import MeasuredSensor, SourceOptions, characterise_log, is_log
 
 WIDEST = 10.0  # m, of a square of a board; more are millimetres
 NODES, CORNERS = 2, 3  # least numbers across and down, of nodes of a bias map and of corners
 
 
-def characterise_source(source: Path, options: SourceOptions) -> Measured:
+def characterise_source(source: Path, options: SourceOptions) -> MeasuredSensor:
     """The sensor of a log folder or of a folder of images.
 
     Raises
@@ -42,17 +42,17 @@ def characterise_source(source: Path, options: SourceOptions) -> Measured:
     from consistency.stereo.characterising.boards import characterise_board
 
     model = options.distortion or "full"
-    return Measured(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
+    return MeasuredSensor(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 
 
-def _of_sequence(source: Path, options: SourceOptions) -> Measured:
+def _of_sequence(source: Path, options: SourceOptions) -> MeasuredSensor:
     from consistency.stereo.characterising.from_pairs import characterise_images
 
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
     if options.grid is not None:
         raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
-    return Measured(characterise_images(source, options), {})
+    return MeasuredSensor(characterise_images(source, options), {})
 
 
 def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
@@ -64,6 +64,7 @@ def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
         ``text`` is something else, or one of them is below ``least``.
     """
     one, cross, two = text.lower().partition("x")
-    if not (cross and one.isdecimal() and two.isdecimal() and min(int(one), int(two)) >= least):
+    are_numbers = one.isdecimal() and two.isdecimal()
+    if not cross or not are_numbers or min(int(one), int(two)) < least:
         raise InputError(f"{option} {text}: must be two numbers of at least {least}, as 9x6")
     return int(one), int(two)

@@ -9,7 +9,12 @@ if TYPE_CHECKING:
     from consistency.stereo.characterising.characterise import Characterisation
 
 
-def write_sensor_reports(of: Characterisation, folder: Path, data: str, overwrite: bool = False) -> list[Path]:
+def write_sensor_reports(
+    of: Characterisation,
+    folder: Path,
+    data: str,
+    overwrite: bool = False,
+) -> list[Path]:
     """``report.html``, ``report.pdf`` and ``characterisation.json`` in a folder that appears whole or not at all.
 
     Parameters

@@ -9,20 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
-from consistency.referee.document.blocks import Cell, Chapter, Column, Document, Facts, Figure, Table, Text, table
+from consistency.referee.document.blocks import Chapter, Document, Facts, Figure, Text
 from consistency.referee.document.colours import BAND, COLOURS, EXPECTED, Look, style
-from consistency.referee.pages.origin import facts
-from consistency.referee.show.painting import add_legend, band, canvas, dots, log_axis, stroke
+from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.show.matplotlib_style import add_legend, band, canvas, dots, log_axis, stroke
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
-from consistency.stereo.characterising.sensor_text import counted, interval, sentences
+from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
-MEASURED, NORMAL, STUDENT = Look(COLOURS[0]), Look("#333333"), Look(COLOURS[1], (5.0, 2.0))
+MEASURED = Look(COLOURS[0])
+NORMAL = Look("#333333")
+STUDENT = Look(COLOURS[1], (5.0, 2.0))
 LOCAL = Look("#7f7f7f", marker="s", size=3.4)
+HEADS = ("Coordinate", "Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
 REACH = 5.0  # standard deviations of the distribution that are drawn
 BINS = 60
 LOCALLY = 20  # groups of equal size in which a standard deviation is drawn
@@ -30,8 +33,10 @@ LOCALLY = 20  # groups of equal size in which a standard deviation is drawn
 
 def compose_sensor(of: Characterisation, manifest: Mapping[str, Any]) -> Document:
     """The document that HTML and PDF show."""
+    caption = f"Intervals hold together with {100 * (1 - of.level.rate):g} %; 1/nu is 0 for a Gaussian noise."
+    estimates = estimates_table(of, HEADS, 3, caption)
     chapters = [
-        Chapter("estimates", "Estimates", "Estimates", (_estimates(of), *(Text(s) for s in sentences(of)))),
+        Chapter("estimates", "Estimates", "Estimates", (estimates, *map(Text, sentences(of)))),
         Chapter("disparity", "Noise over disparity", "Disparity", (_over_disparity(of),)),
     ]
     if of.bias is not None and of.bias.grid.known.any():
@@ -43,18 +48,6 @@ def compose_sensor(of: Characterisation, manifest: Mapping[str, Any]) -> Documen
     return Document(f"Sensor: {of.source}", counted(of) + ".", tuple(chapters))
 
 
-def _estimates(of: Characterisation) -> Table:
-    heads = ("Coordinate", "Noise (px)", "Correlation", "Offset share", "1/nu", "Kurtosis", "Pooled (px)")
-    columns = tuple(Column(head, number=i > 0) for i, head in enumerate(heads))
-    rows: list[tuple[Cell, ...]] = []
-    for c in of.coordinates:
-        texts = ("–" if e is None else interval(e, 2) for e in (c.correlation, c.offset, c.tails.weight))
-        pooled = f"{c.pooled:.3g}" if np.isfinite(c.pooled) else "–"
-        rows.append((c.name, interval(c.sigma, 3), *texts, f"{c.tails.excess_kurtosis:.2f}", pooled))
-    caption = f"Intervals hold together with {100 * (1 - of.level.rate):g} %; 1/nu is 0 for a Gaussian noise."
-    return table(columns, rows, "Estimates of the sensor", caption=caption)
-
-
 # --- figures ----------------------------------------------------------------------------------------
 
 
@@ -64,8 +57,8 @@ def _over_disparity(of: Characterisation) -> Figure:
     def draw() -> Drawing:
         figure, (axes,) = canvas(2.2)
         if of.growth is not None:
-            sigma = np.array([(s.value, s.low, s.high) for s in of.growth.sigma])
-            nodes = np.asarray(of.growth.nodes)
+            sigma = np.array(of.growth.sigma)
+            nodes = of.growth.nodes
             band(axes, nodes, sigma[:, 1:], "interval")
             axes.plot(nodes, sigma[:, 0], label="sigma of d", marker="o", markersize=3.4, **stroke(MEASURED))
         axes.plot(*local_spread(of), label="all of a group", **dots(LOCAL))
@@ -84,17 +77,23 @@ def _over_disparity(of: Characterisation) -> Figure:
 
 def local_spread(of: Characterisation) -> tuple[Array, Array]:
     """Median disparity and standard deviation of r of disparity, px, in groups of about equal size."""
-    order = np.argsort(of.kept.ideal[:, 2])
-    groups = [g for g in np.array_split(order, min(LOCALLY, max(len(order) // 20, 1))) if len(g) > 1]
-    d = np.array([np.median(of.kept.ideal[g, 2]) for g in groups])
-    return d, np.array([of.kept.r[g, 2].std(ddof=1) for g in groups])
+    disparity = of.kept.ideal[:, 2]
+    groups = min(LOCALLY, max(len(disparity) // 20, 1))
+    middles = []
+    spreads = []
+    for group in np.array_split(np.argsort(disparity), groups):
+        if len(group) > 1:
+            middles.append(np.median(disparity[group]))
+            spreads.append(of.kept.r[group, 2].std(ddof=1))
+    return np.array(middles), np.array(spreads)
 
 
 def _bias_map(of: Characterisation) -> Figure:
     """Lines over u of the bias of u, v and d, one for each row of nodes."""
     assert of.bias is not None
-    bias, grid = of.bias, of.bias.grid
-    reach = 1.15 * max(float(np.nanmax(np.abs(bias.value) + bias.half)), 0.1)
+    bias = of.bias
+    grid = of.bias.grid
+    reach = 1.15 * max(np.nanmax(np.abs(bias.value) + bias.half), 0.1)
 
     def draw() -> Drawing:
         figure, panels = canvas(1.9, 3, 3)
@@ -107,7 +106,7 @@ def _bias_map(of: Characterisation) -> Figure:
             axes.set(xlabel="u (px)", ylabel=f"bias of {name} (px)", ylim=(-reach, reach))
         return add_legend(figure)
 
-    middle = float(np.nanmedian(bias.half))
+    middle = np.nanmedian(bias.half)
     caption = (
         f"Bias of u, v and d at the nodes of the map (fig. 8), before any shrinkage; the median of the intervals is "
         f"±{middle:.2g} px. Nodes with too few data are left out."
@@ -155,16 +154,18 @@ def _correlation(of: Characterisation) -> tuple[Figure, ...]:
 
 
 def _draw_lags(of: Characterisation) -> Drawing:
-    found = np.concatenate([np.abs(c.lags[np.isfinite(c.lags)]) for c in of.coordinates])
-    reach = 1.15 * max(float(found.max()), 0.1)
+    largest = np.nanmax([c.lags for c in of.coordinates])
+    smallest = np.nanmin([c.lags for c in of.coordinates])
+    reach = 1.15 * max(largest, -smallest, 0.1)
     figure, panels = canvas(1.5, 3, 3)
     for c, axes in zip(of.coordinates, panels, strict=True):
         lags = np.flatnonzero(np.isfinite(c.lags)) + 1
-        bound = float(np.nanmax(c.bounds))
+        values = c.lags[lags - 1]
+        bound = np.nanmax(c.bounds)
         axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
         axes.axhline(0.0, **stroke(EXPECTED))
-        axes.vlines(lags, 0.0, c.lags[lags - 1], color=MEASURED.colour, linewidth=MEASURED.width)
-        axes.plot(lags, c.lags[lags - 1], **dots(MEASURED))
+        axes.vlines(lags, 0.0, values, color=MEASURED.colour, linewidth=MEASURED.width)
+        axes.plot(lags, values, **dots(MEASURED))
         ticks = lags[:: max(1, len(lags) // 5)]
         axes.set(xlabel="lag (steps)", ylabel="correlation", title=c.name, ylim=(-reach, reach), xticks=ticks)
     return figure

@@ -12,7 +12,10 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
 
-FOCAL, BASELINE, SIZE = 150.0, 0.09, (320, 240)  # px, m, px: Herath et al. (2007) sec. 4.5, as herath2007-stereo
+# Herath et al. (2007) sec. 4.5, as herath2007-stereo
+FOCAL = 150.0  # px
+BASELINE = 0.09  # m
+SIZE = (320, 240)  # px
 NEWTON = 12  # steps, after which an undistorted radius is exact to rounding
 
 
@@ -26,7 +29,7 @@ class Lens:
     def distort(self, m: Array) -> Array:
         """Where points (..., 2) are seen, both in units of f."""
         r2 = np.square(m).sum(axis=-1, keepdims=True)
-        return np.asarray(m * (1.0 + self.k1 * r2 + self.k2 * r2**2))
+        return m * (1.0 + self.k1 * r2 + self.k2 * r2**2)
 
     def undistort(self, m: Array) -> Array:
         """The points (..., 2) that are seen at ``m``, by Newton's method on the radius.
@@ -46,7 +49,9 @@ class Lens:
                     "length from its centre; give a weaker distortion or a smaller image"
                 )
             r -= (r * (1.0 + self.k1 * r**2 + self.k2 * r**4) - seen) / slope
-        return np.asarray(m * np.where(seen > 0.0, r / np.where(seen > 0.0, seen, 1.0), 1.0))
+        zoom = np.ones_like(r)
+        np.divide(r, seen, out=zoom, where=seen > 0.0)
+        return m * zoom
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,8 @@ class Camera:
     def pixels(self) -> Array:
         """u, v of all pixels (h, w, 2): px from the middle of the image, right and down."""
         width, height = self.size
-        u, v = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
-        return np.stack([u, v], axis=-1)
+        v, u = np.indices((height, width))
+        return np.stack([u - (width - 1) / 2, v - (height - 1) / 2], axis=-1)
 
     @cached_property
     def field(self) -> Array:
@@ -87,13 +92,15 @@ class Camera:
     def rays(self, uv: Array) -> Array:
         """Directions (..., 3) that places (..., 2) of the rectified image really look in; x is about 1."""
         m = self.lens.undistort(self.corrected.distort(np.asarray(uv, float) / self.f))
-        return np.asarray(np.stack([np.ones(m.shape[:-1]), -m[..., 0], -m[..., 1]], axis=-1) @ self._R.T)
+        rays = np.ones((*m.shape[:-1], 3))
+        rays[..., 1:] = -m
+        return rays @ self._R.T
 
     def project(self, points: Array) -> Array:
         """Where points (..., 3) in the camera's nominal frame, m, really are in the rectified image, (..., 2) px."""
         own = points @ self._R
-        m = np.stack([-own[..., 1] / own[..., 0], -own[..., 2] / own[..., 0]], axis=-1)
-        return np.asarray(self.f * self.corrected.undistort(self.lens.distort(m)))
+        m = -own[..., 1:] / own[..., :1]
+        return self.f * self.corrected.undistort(self.lens.distort(m))
 
 
 @dataclass(frozen=True)
@@ -139,7 +146,8 @@ class StereoCamera:
 
     def real(self, points: Array) -> Array:
         """(u, v, d) in px of points (N, 3) with the cameras as they are: what a chain without noise would measure."""
-        left, right = self.left.project(points), self.right.project(points - self.offset)
+        left = self.left.project(points)
+        right = self.right.project(points - self.offset)
         return np.column_stack([left, left[:, 0] - right[:, 0]])
 
     def inside(self, uv: Array, margin: float = 0.0) -> Array:

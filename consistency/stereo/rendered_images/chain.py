@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -31,12 +31,22 @@ from consistency.stereo.rendered_images.stages import (
     TrackResidual,
     dissimilarity,
     patches,
+    square,
 )
 
-KEPT, NO_DISPARITY, REJECTED = 0, 1, 2  # flags of an observation
-POINT, JUNCTION, MISMATCH, DRIFTED = 0, 1, 2, 3  # labels of an observation, which only the truth tells
+# flags of an observation
+KEPT = 0
+NO_DISPARITY = 1
+REJECTED = 2
+# labels of an observation, which only the truth tells
+POINT = 0
+JUNCTION = 1
+MISMATCH = 2
+DRIFTED = 3
 GROSS = 2.0  # px from where it should be: a mismatch in d, a drift in u or v
-WINDOW, SHARE, STEP = 13.0, 0.1, 1.0  # px; a junction has this share of two depths in its window, STEP px apart
+WINDOW = 13.0  # px, about a feature; a junction has two depths in it
+SHARE = 0.1  # of the window that each of the two depths has
+STEP = 1.0  # px between the two depths
 EDGE = 3.0  # px from the border at which a track ends
 
 STAGES: dict[str, dict[str, type[Any]]] = {
@@ -99,7 +109,7 @@ class Tracks:
 
     def take(self, chosen: Array) -> Tracks:
         """The observations for which ``chosen`` (M,) is true."""
-        return Tracks(*(getattr(self, each.name)[chosen] for each in fields(self)))
+        return Tracks(*(values[chosen] for values in vars(self).values()))
 
     @property
     def kept(self) -> Tracks:
@@ -109,15 +119,18 @@ class Tracks:
 
 def join_tracks(parts: Sequence[Tracks]) -> Tracks:
     """Tracks of several sequences: each has a number of its own, and so has every track of all of them."""
-    sequence = np.concatenate([np.full(len(part), k) for k, part in enumerate(parts)])
-    shift = np.cumsum([0] + [int(part.track.max(initial=-1)) + 1 for part in parts])
-    track = np.concatenate([part.track + start for part, start in zip(parts, shift, strict=False)])
-    rest = {
-        each.name: np.concatenate([getattr(part, each.name) for part in parts])
-        for each in fields(Tracks)
-        if each.name not in ("sequence", "track")
-    }
-    return Tracks(sequence=sequence, track=track, **rest)
+    numbered = []
+    tracks = 0
+    for k, part in enumerate(parts):
+        sequence = np.full(len(part), k)
+        numbered.append(replace(part, sequence=sequence, track=part.track + tracks))
+        tracks += int(part.track.max(initial=-1)) + 1
+    return _concatenated(numbered)
+
+
+def _concatenated(parts: Sequence[Tracks]) -> Tracks:
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Tracks(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True)
@@ -145,11 +158,19 @@ class Chain:
     ) -> Chain:
         """A chain of named stages (:data:`STAGES`), with ``settings`` by role, or by name for filters."""
         given = settings or {}
-        stages = {"selection": selection, "tracking": tracking, "correspondence": correspondence}
-        made = {role: stage(role, name, **given.get(role, {})) for role, name in stages.items()}
-        return cls(**made, filters=tuple(stage("filter", name, **given.get(name, {})) for name in filters))
+        return cls(
+            stage("selection", selection, **given.get("selection", {})),
+            stage("tracking", tracking, **given.get("tracking", {})),
+            stage("correspondence", correspondence, **given.get("correspondence", {})),
+            tuple(stage("filter", name, **given.get(name, {})) for name in filters),
+        )
 
-    def run(self, frames: Iterable[StereoFrame], scene: Scene, camera: StereoCamera) -> Tracks:
+    def run(
+        self,
+        frames: Iterable[StereoFrame],
+        scene: Scene,
+        camera: StereoCamera,
+    ) -> Tracks:
         """Tracks of the features of the first frame through all frames.
 
         Raises
@@ -157,7 +178,8 @@ class Chain:
         InputError
             The search range misses every depth of the scene, or an image is smaller than a stage's window.
         """
-        state, parts = None, []
+        state = None
+        parts = []
         for number, frame in enumerate(frames):
             if state is None:
                 self._require_depths(scene, camera, frame.pose)
@@ -167,14 +189,22 @@ class Chain:
             parts.append(_observed(self, state, number, frame, camera))
         if state is None:
             raise InputError("frames: there is none; give at least one image pair")
-        return Tracks(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Tracks)))
+        return _concatenated(parts)
 
-    def _require_depths(self, scene: Scene, camera: StereoCamera, pose: Array) -> None:
-        points, layer = scene.seen(pose, camera.left.field[::8, ::8].reshape(-1, 3))
+    def _require_depths(
+        self,
+        scene: Scene,
+        camera: StereoCamera,
+        pose: Array,
+    ) -> None:
+        rays = camera.left.field[::8, ::8].reshape(-1, 3)
+        points, layer = scene.seen(pose, rays)
         d = camera.ideal(to_camera(pose, points[layer >= 0]))[:, 2]
         low, high = self.correspondence.search
         if not ((d >= low) & (d <= high)).any():
-            seen = f"has disparities from {d.min():.1f} to {d.max():.1f} px" if len(d) else "is not in the image"
+            seen = "is not in the image"
+            if len(d):
+                seen = f"has disparities from {d.min():.1f} to {d.max():.1f} px"
             raise InputError(f"search: {low} to {high} px misses every depth of the scene, which {seen}; widen it")
 
 
@@ -191,59 +221,108 @@ class _State:
     d: Array  # (N,), disparity at selection
 
     def keep(self, chosen: Array) -> None:
-        for name in ("uv", "track", "anchors", "junction", "patch", "d"):
-            setattr(self, name, getattr(self, name)[chosen])
+        self.uv = self.uv[chosen]
+        self.track = self.track[chosen]
+        self.anchors = self.anchors[chosen]
+        self.junction = self.junction[chosen]
+        self.patch = self.patch[chosen]
+        self.d = self.d[chosen]
 
 
-def _begin(chain: Chain, frame: StereoFrame, scene: Scene, camera: StereoCamera) -> _State:
+def _begin(
+    chain: Chain,
+    frame: StereoFrame,
+    scene: Scene,
+    camera: StereoCamera,
+) -> _State:
     uv = chain.selection.choose(frame.left)
     anchors, layer = scene.seen(frame.pose, camera.left.rays(uv))
     d = _disparities(chain, frame, uv, camera.real(to_camera(frame.pose, anchors)))
-    good = (layer >= 0) & (np.isfinite(d) if chain.stereo_first else True)
-    uv, anchors, d = uv[good], anchors[good], d[good]
-    patch = patches(frame.left, uv, np.ones(len(uv)))
-    return _State(frame.left, uv, np.arange(len(uv)), anchors, at_junction(scene, camera, frame.pose, uv), patch, d)
+    good = layer >= 0
+    if chain.stereo_first:
+        good &= np.isfinite(d)
+    uv = uv[good]
+    return _State(
+        frame.left,
+        uv,
+        track=np.arange(len(uv)),
+        anchors=anchors[good],
+        junction=at_junction(scene, camera, frame.pose, uv),
+        patch=patches(frame.left, uv, np.ones(len(uv))),
+        d=d[good],
+    )
 
 
-def _follow(chain: Chain, state: _State, frame: StereoFrame, camera: StereoCamera) -> None:
+def _follow(
+    chain: Chain,
+    state: _State,
+    frame: StereoFrame,
+    camera: StereoCamera,
+) -> None:
     true = camera.left.project(to_camera(frame.pose, state.anchors))
     state.uv, found = chain.tracking.follow(state.image, frame.left, state.uv, true)
     state.image = frame.left
     state.keep(found & camera.inside(state.uv, EDGE))
 
 
-def _observed(chain: Chain, state: _State, number: int, frame: StereoFrame, camera: StereoCamera) -> Tracks:
+def _observed(
+    chain: Chain,
+    state: _State,
+    number: int,
+    frame: StereoFrame,
+    camera: StereoCamera,
+) -> Tracks:
     real = camera.real(to_camera(frame.pose, state.anchors))
     d = _disparities(chain, frame, state.uv, real)
-    now = patches(frame.left, state.uv, np.where(np.isfinite(d * state.d), d / state.d, 1.0))
-    unlike = dissimilarity(state.patch, now)
+    zoom = np.where(np.isfinite(d * state.d), d / state.d, 1.0)
+    unlike = dissimilarity(state.patch, patches(frame.left, state.uv, zoom))
     evidence = PairObservations(frame.left, frame.right, state.uv, d, unlike, chain.correspondence)
-    flag = np.where(np.isfinite(d), KEPT, NO_DISPARITY)
+    flag = np.full(len(d), KEPT)
+    flag[~np.isfinite(d)] = NO_DISPARITY
     for check in chain.filters:
-        flag = np.where((flag == KEPT) & ~check.keep(evidence), REJECTED, flag)
+        flag[(flag == KEPT) & ~check.keep(evidence)] = REJECTED
     z = np.column_stack([state.uv, d])
     off = np.abs(z - real)
-    label = np.where(off[:, 2] > GROSS, MISMATCH, POINT)
-    label = np.where((off[:, :2] > GROSS).any(axis=1), DRIFTED, label)
-    label = np.where(state.junction, JUNCTION, label)
-    truth = camera.ideal(to_camera(frame.nominal, state.anchors))
-    same = np.zeros(len(d), np.int64)
-    return Tracks(same, same + number, state.track, z, truth, real, unlike, label, flag)
+    label = np.full(len(d), POINT)
+    label[off[:, 2] > GROSS] = MISMATCH
+    label[(off[:, :2] > GROSS).any(axis=1)] = DRIFTED
+    label[state.junction] = JUNCTION
+    return Tracks(
+        sequence=np.zeros(len(d), np.int64),
+        frame=np.full(len(d), number),
+        track=state.track,
+        z=z,
+        truth=camera.ideal(to_camera(frame.nominal, state.anchors)),
+        real=real,
+        dissimilarity=unlike,
+        label=label,
+        flag=flag,
+    )
 
 
-def _disparities(chain: Chain, frame: StereoFrame, uv: Array, real: Array) -> Array:
+def _disparities(
+    chain: Chain,
+    frame: StereoFrame,
+    uv: Array,
+    real: Array,
+) -> Array:
     if isinstance(chain.correspondence, KnownDisparity):
-        return np.asarray(real[:, 2])
+        return real[:, 2]
     return chain.correspondence.measure(frame.left, frame.right, uv)
 
 
-def at_junction(scene: Scene, camera: StereoCamera, pose: Array, uv: Array) -> Array:
+def at_junction(
+    scene: Scene,
+    camera: StereoCamera,
+    pose: Array,
+    uv: Array,
+) -> Array:
     """Whether the window of a feature (N, 2) px shows two depths, so that it is on the edge of a layer, (N,) bool."""
-    reach = np.linspace(-WINDOW / 2.0, WINDOW / 2.0, 7)
-    grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    grid = square(np.linspace(-WINDOW / 2.0, WINDOW / 2.0, 7))
     rays = camera.left.rays(uv[:, None] + grid)
     points, layer = scene.seen(pose, rays.reshape(-1, 3))
-    d = np.where(layer >= 0, camera.f * camera.B / to_camera(pose, points)[:, 0], 0.0).reshape(len(uv), -1)
+    depth = to_camera(pose, points)[:, 0]
+    d = np.where(layer >= 0, camera.f * camera.B / depth, 0.0).reshape(len(uv), -1)
     d.sort(axis=1)
     few = int(np.ceil(SHARE * d.shape[1]))
-    return np.asarray(d[:, -few] - d[:, few - 1] > STEP)
+    return d[:, -few] - d[:, few - 1] > STEP

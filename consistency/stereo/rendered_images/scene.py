@@ -24,7 +24,12 @@ NOWHERE = -1  # layer of a ray that hits none
 class Texture(Protocol):
     """Grey values of a surface."""
 
-    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+    def grey(
+        self,
+        a: Array,
+        b: Array,
+        blur: Array | float,
+    ) -> Array:
         """Grey values (N,) at ``a``, ``b`` (N,), m, seen through a Gaussian point spread of sd ``blur`` in m."""
 
 
@@ -34,7 +39,12 @@ class Plain:
 
     value: float = MIDDLE
 
-    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+    def grey(
+        self,
+        a: Array,
+        b: Array,
+        blur: Array | float,
+    ) -> Array:
         return np.full(a.shape, self.value, np.float32)
 
 
@@ -54,7 +64,11 @@ class RandomTexture:
 
     @classmethod
     def draw(
-        cls, rng: np.random.Generator, finest: float = 0.012, octaves: int = 7, contrast: float = 14.0
+        cls,
+        rng: np.random.Generator,
+        finest: float = 0.012,
+        octaves: int = 7,
+        contrast: float = 14.0,
     ) -> RandomTexture:
         """A texture with wavelengths from ``finest`` to ``finest * 2**octaves``, m."""
         frequency = np.fft.fftfreq(TILE)
@@ -62,17 +76,24 @@ class RandomTexture:
         ring = (radius > 0.5 / SAMPLES) & (radius <= 1.0 / SAMPLES)
         tiles = []
         for _ in range(octaves):
-            tile = np.fft.ifft2(np.fft.fft2(rng.standard_normal((TILE, TILE))) * ring).real
+            noise = rng.standard_normal((TILE, TILE))
+            tile = np.fft.ifft2(np.fft.fft2(noise) * ring).real
             tiles.append((tile / tile.std()).astype(np.float32))
         return cls(tuple(tiles), tuple(finest * 2.0**k for k in range(octaves)), contrast)
 
-    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+    def grey(
+        self,
+        a: Array,
+        b: Array,
+        blur: Array | float,
+    ) -> Array:
         total = np.full(a.shape, MIDDLE, np.float32)
         for tile, shortest in zip(self.tiles, self.wavelengths, strict=True):
             kept = np.exp(-2.0 * (np.pi * np.asarray(blur) * 0.75 / shortest) ** 2)  # 0.75: middle of the octave
             if np.max(kept) > FAINT:
                 scale = SAMPLES / shortest
-                total += np.float32(self.contrast) * kept.astype(np.float32) * sampled(tile, scale * b, scale * a)
+                contrast = np.float32(self.contrast) * kept.astype(np.float32)
+                total += contrast * sampled(tile, scale * b, scale * a)
         return total
 
 
@@ -91,7 +112,13 @@ class Blobs:
     ground: float = 170.0
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, cell: float = 0.35, radius: float = 0.035, count: int = 64) -> Blobs:
+    def draw(
+        cls,
+        rng: np.random.Generator,
+        cell: float = 0.35,
+        radius: float = 0.035,
+        count: int = 64,
+    ) -> Blobs:
         """Spots in ``count`` by ``count`` cells of side ``cell``."""
         room = max(0.5 * cell - 3.0 * radius, 0.0)
         return cls(rng.uniform(-room, room, (count, count, 2)), cell, radius)
@@ -100,13 +127,20 @@ class Blobs:
         """Middle of the spots (N, 2), a and b in m, in cells ``i`` along a and ``j`` along b."""
         n = len(self.offsets)
         offset = self.offsets[np.mod(j, n), np.mod(i, n)]
-        return np.asarray(np.stack([i + 0.5, j + 0.5], axis=-1) * self.cell + offset)
+        return np.stack([i + 0.5, j + 0.5], axis=-1) * self.cell + offset
 
-    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
-        i, j = np.floor(a / self.cell).astype(int), np.floor(b / self.cell).astype(int)
+    def grey(
+        self,
+        a: Array,
+        b: Array,
+        blur: Array | float,
+    ) -> Array:
+        i = np.floor(a / self.cell).astype(int)
+        j = np.floor(b / self.cell).astype(int)
         off = np.stack([a, b], axis=-1) - self.centres(i, j)
         variance = self.radius**2 + np.square(blur)
-        spot = self.radius**2 / variance * np.exp(-0.5 * np.square(off).sum(axis=-1) / variance)
+        squared = np.square(off).sum(axis=-1)
+        spot = self.radius**2 / variance * np.exp(-0.5 * squared / variance)
         return np.asarray(self.ground - self.depth * spot, np.float32)
 
 
@@ -117,21 +151,30 @@ class Painted:
     ground: Texture
     marks: Texture
 
-    def grey(self, a: Array, b: Array, blur: Array | float) -> Array:
+    def grey(
+        self,
+        a: Array,
+        b: Array,
+        blur: Array | float,
+    ) -> Array:
         return self.ground.grey(a, b, blur) + self.marks.grey(a, b, blur) - MIDDLE
 
 
 def sampled(tile: Array, row: Array, column: Array) -> Array:
     """Bilinear values (N,) of a periodic tile (n, n), n a power of 2, at rows and columns (N,)."""
     n = tile.shape[0]
-    i, j = np.floor(row), np.floor(column)
-    di, dj = (row - i).astype(np.float32), (column - j).astype(np.float32)
-    top, left = i.astype(np.int64) & (n - 1), j.astype(np.int64) & (n - 1)
-    below, right = (top + 1) & (n - 1), (left + 1) & (n - 1)
+    i = np.floor(row)
+    j = np.floor(column)
+    di = (row - i).astype(np.float32)
+    dj = (column - j).astype(np.float32)
+    top = i.astype(np.int64) & (n - 1)
+    left = j.astype(np.int64) & (n - 1)
+    below = (top + 1) & (n - 1)
+    right = (left + 1) & (n - 1)
     flat = tile.ravel()
     upper = flat[top * n + left] * (1 - dj) + flat[top * n + right] * dj
     lower = flat[below * n + left] * (1 - dj) + flat[below * n + right] * dj
-    return np.asarray(upper * (1 - di) + lower * di)
+    return upper * (1 - di) + lower * di
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +215,9 @@ class Layer:
         """
         right = np.array([np.sin(slant), -np.cos(slant), 0.0])
         middle = np.array([distance, *centre])
-        return cls(middle, right, np.array([0.0, 0.0, -1.0]), (0.5 * size[0], 0.5 * size[1]), texture)
+        down = np.array([0.0, 0.0, -1.0])
+        width, height = size
+        return cls(middle, right, down, (0.5 * width, 0.5 * height), texture)
 
     def meet(self, origin: Array, rays: Array) -> tuple[Array, Array, Array]:
         """Where rays (N, 3) from ``origin`` (3,) meet the plane.
@@ -194,7 +239,7 @@ class Layer:
 
     def points(self, a: Array, b: Array) -> Array:
         """Points (N, 3) in the world at coordinates (N,), m."""
-        return np.asarray(self.middle + a[:, None] * self.right + b[:, None] * self.down)
+        return self.middle + a[:, None] * self.right + b[:, None] * self.down
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,14 +266,17 @@ class Scene:
         layer : (N,), number of the layer, -1 for none
         """
         turned = rays @ rotation(*pose[3:]).T
-        points, number = np.full((len(rays), 3), np.nan), np.full(len(rays), NOWHERE)
+        points = np.full((len(rays), 3), np.nan)
+        number = np.full(len(rays), NOWHERE)
         for k, layer in enumerate(self.layers):
             reach, a, b = layer.meet(pose[:3], turned)
-            hit = (reach > 0.0) & np.isfinite(reach) & (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
-            points[hit], number[hit] = layer.points(a[hit], b[hit]), k
+            hit = (reach > 0.0) & np.isfinite(reach)
+            hit &= (np.abs(a) <= layer.half[0]) & (np.abs(b) <= layer.half[1])
+            points[hit] = layer.points(a[hit], b[hit])
+            number[hit] = k
         return points, number
 
 
 def to_camera(pose: Array, points: Array) -> Array:
     """Points (N, 3) of the world in the frame of a camera at ``pose`` (6,), m."""
-    return np.asarray((points - pose[:3]) @ rotation(*pose[3:]))
+    return (points - pose[:3]) @ rotation(*pose[3:])

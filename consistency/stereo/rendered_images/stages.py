@@ -7,7 +7,7 @@ Correspondence (5): disparities of features from the images of a pair. Filtering
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -18,7 +18,8 @@ from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 BLOCK = 7  # px, window of the structure tensor
 MARGIN = 12.0  # px from the border, so that the windows of later stages are whole
-STEPS, SMALL = 40, 0.003  # iterations of Lucas & Kanade at most; px of a step that ends them
+STEPS = 40  # iterations of Lucas & Kanade, at most
+SMALL = 0.003  # px of a step that ends them
 SEARCH = (1, 32)  # px, Herath et al. (2007) sec. 3.4
 STEP = 16  # OpenCV's matchers search a multiple of this many disparities, in sixteenths of a px
 PATCH = 15  # px, side of the patches that are compared
@@ -45,9 +46,12 @@ class GoodFeatures:
     def choose(self, image: Array) -> Array:
         require_size(image, 2 * int(MARGIN) + BLOCK, "the margin of the selection")
         mask = np.zeros(image.shape, np.uint8)
-        mask[int(MARGIN) : -int(MARGIN), int(MARGIN) : -int(MARGIN)] = 1
+        inner = slice(int(MARGIN), -int(MARGIN))
+        mask[inner, inner] = 1
         found = opencv().goodFeaturesToTrack(image, self.count, self.quality, self.distance, mask=mask, blockSize=BLOCK)
-        return np.empty((0, 2)) if found is None else from_columns(image, found.reshape(-1, 2).astype(float))
+        if found is None:
+            return np.empty((0, 2))
+        return from_columns(image, found.reshape(-1, 2).astype(float))
 
 
 @dataclass(frozen=True)
@@ -63,19 +67,20 @@ class Spread:
     def choose(self, image: Array) -> Array:
         uv = GoodFeatures(0, self.quality, self.distance).choose(image)  # 0: all of them
         shape = np.array([self.columns, self.rows])
-        cell = np.clip(((uv / image.shape[::-1] + 0.5) * shape).astype(int), 0, shape - 1) @ [1, self.columns]
-        turn = np.array([np.count_nonzero(cell[:i] == own) for i, own in enumerate(cell)], int)
+        place = ((uv / image.shape[::-1] + 0.5) * shape).astype(int)
+        cell = np.clip(place, 0, shape - 1) @ [1, self.columns]
+        turn = np.tril(cell[:, None] == cell, -1).sum(axis=1)  # how many of its cell are stronger
         return uv[np.argsort(turn, kind="stable")[: self.count]]
 
 
 def to_columns(image: Array, uv: Array) -> Array:
     """Places (N, 2) px from the middle of an image, from the centre of its first pixel."""
-    return np.asarray(uv + (np.array(image.shape[::-1]) - 1.0) / 2.0)
+    return uv + (np.array(image.shape[::-1]) - 1.0) / 2.0
 
 
 def from_columns(image: Array, places: Array) -> Array:
     """The inverse of :func:`to_columns`."""
-    return np.asarray(places - (np.array(image.shape[::-1]) - 1.0) / 2.0)
+    return places - (np.array(image.shape[::-1]) - 1.0) / 2.0
 
 
 def require_size(image: Array, least: int, what: str) -> None:
@@ -91,7 +96,13 @@ def require_size(image: Array, least: int, what: str) -> None:
 class Tracking(Protocol):
     """Follows features from one left image to the next."""
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         """Where features are in ``after``.
 
         Parameters
@@ -111,7 +122,13 @@ class Tracking(Protocol):
 class KnownProjection:
     """No tracker: each feature is where its point is projected."""
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         return true, np.ones(len(uv), bool)
 
 
@@ -123,7 +140,13 @@ class Klt:
     levels: int = 3
     agreement: float | None = None
 
-    def follow(self, before: Array, after: Array, uv: Array, true: Array) -> tuple[Array, Array]:
+    def follow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+        true: Array,
+    ) -> tuple[Array, Array]:
         require_size(before, self.window + 2, f"the tracker's window of {self.window} px")
         there, found = self.flow(before, after, uv)
         if self.agreement is not None:
@@ -131,7 +154,12 @@ class Klt:
             found &= again & (np.hypot(*(back - uv).T) <= self.agreement)
         return there, found
 
-    def flow(self, before: Array, after: Array, uv: Array) -> tuple[Array, Array]:
+    def flow(
+        self,
+        before: Array,
+        after: Array,
+        uv: Array,
+    ) -> tuple[Array, Array]:
         if not len(uv):
             return uv, np.zeros(0, bool)
         cv2 = opencv()
@@ -150,7 +178,12 @@ class Correspondence(Protocol):
     def search(self) -> tuple[int, int]:
         """Least and greatest disparity, px."""
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         """Disparities (N,) of places ``uv`` (N, 2), px from the middle of the left image; NaN where there is none."""
 
 
@@ -174,7 +207,8 @@ def _at(places: Array, disparities: Array, search: tuple[int, int]) -> Array:
     """
     height, width = disparities.shape
     column, row = np.rint(places).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside = (column >= 0) & (column < width)
+    inside &= (row >= 0) & (row < height)
     d = np.full(len(places), np.nan)
     d[inside] = disparities[row[inside], column[inside]] / STEP
     d[(d <= search[0]) | (d >= search[1])] = np.nan
@@ -190,7 +224,12 @@ class BlockMatching:
     uniqueness: int = 10  # % by which the best match must be better than others
     texture: int = 10  # least texture of a block
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         count = _searched(left, self.search, self.block)
         matcher: Any = opencv().StereoBM_create(count, self.block)
         matcher.setMinDisparity(self.search[0])
@@ -207,7 +246,12 @@ class SemiGlobal:
     block: int = 5  # px, odd
     uniqueness: int = 10  # %
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         count = _searched(left, self.search, self.block)
         area = self.block**2
         matcher: Any = opencv().StereoSGBM_create(
@@ -225,13 +269,19 @@ class KltAcross:
     levels: int = 3
     rows: float = 1.5
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         _require_range(self.search)
         tracker = Klt(self.window, self.levels)
         there, found = tracker.follow(left, right, uv, uv)
         d = uv[:, 0] - there[:, 0]
-        good = found & (np.abs(uv[:, 1] - there[:, 1]) <= self.rows) & (d >= self.search[0]) & (d <= self.search[1])
-        return np.where(good, d, np.nan)
+        found &= np.abs(uv[:, 1] - there[:, 1]) <= self.rows
+        found &= (d >= self.search[0]) & (d <= self.search[1])
+        return np.where(found, d, np.nan)
 
 
 @dataclass(frozen=True)
@@ -240,12 +290,16 @@ class KnownDisparity:
 
     search: tuple[int, int] = SEARCH
 
-    def measure(self, left: Array, right: Array, uv: Array) -> Array:
+    def measure(
+        self,
+        left: Array,
+        right: Array,
+        uv: Array,
+    ) -> Array:
         return np.full(len(uv), np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class PairObservations:
+class PairObservations(NamedTuple):
     """N observations of one image pair, as a filter of observations is given them; the truth is not among them."""
 
     left: Array  # (h, w), 8-bit
@@ -271,11 +325,12 @@ class LeftRightCheck:
 
     def keep(self, evidence: PairObservations) -> Array:
         """The right image is searched from its mirror image, in which it is the left one."""
-        left, right = (np.ascontiguousarray(image[:, ::-1]) for image in (evidence.right, evidence.left))
+        left = np.ascontiguousarray(evidence.right[:, ::-1])
+        right = np.ascontiguousarray(evidence.left[:, ::-1])
         own = np.where(np.isfinite(evidence.d), evidence.d, 0.0)
-        there = np.stack([own - evidence.uv[:, 0], evidence.uv[:, 1]], axis=-1)
-        back = evidence.correspondence.measure(left, right, there)
-        return np.asarray(np.abs(back - evidence.d) <= self.tolerance)
+        u, v = evidence.uv.T
+        back = evidence.correspondence.measure(left, right, np.column_stack([own - u, v]))
+        return np.abs(back - evidence.d) <= self.tolerance
 
 
 @dataclass(frozen=True)
@@ -285,7 +340,7 @@ class TrackResidual:
     limit: float = 0.6
 
     def keep(self, evidence: PairObservations) -> Array:
-        return np.asarray(evidence.dissimilarity <= self.limit)
+        return evidence.dissimilarity <= self.limit
 
 
 def patches(image: Array, uv: Array, zoom: Array) -> Array:
@@ -293,12 +348,19 @@ def patches(image: Array, uv: Array, zoom: Array) -> Array:
 
     A patch of ``zoom`` (N,) covers that many times ``PATCH`` px of the image.
     """
-    reach = np.arange(PATCH) - (PATCH - 1) / 2.0
-    grid = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(1, -1, 2)
+    grid = square(np.arange(PATCH) - (PATCH - 1) / 2.0)
     places = to_columns(image, uv)[:, None] + zoom[:, None, None] * grid
-    values = map_coordinates(image.astype(np.float32), places[..., ::-1].transpose(2, 0, 1), order=1, mode="nearest")
-    values = values - values.mean(axis=1, keepdims=True)
-    return np.asarray(values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9))
+    rows_first = places[..., ::-1].transpose(2, 0, 1)
+    values = map_coordinates(image.astype(np.float32), rows_first, order=1, mode="nearest")
+    values -= values.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    return values / np.maximum(length, 1e-9)
+
+
+def square(reach: Array) -> Array:
+    """Places (n * n, 2) of a square, ``reach`` (n,) along each side, row by row."""
+    across, down = np.meshgrid(reach, reach)
+    return np.column_stack([across.ravel(), down.ravel()])
 
 
 def dissimilarity(first: Array, now: Array) -> Array:
@@ -307,4 +369,4 @@ def dissimilarity(first: Array, now: Array) -> Array:
     Shi & Tomasi (1994) sec. 4, of patches whose mean and contrast are taken out; in place of their affine motion a
     patch is zoomed by the measured disparity.
     """
-    return np.asarray(np.linalg.norm(first - now, axis=1))
+    return np.linalg.norm(first - now, axis=1)

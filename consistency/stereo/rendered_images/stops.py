@@ -47,7 +47,12 @@ def pose_at(x: float) -> Array:
 
 
 def stand(
-    chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, workers: int = 1, slant: float = 0.0
+    chain: Chain,
+    camera: StereoCamera,
+    stops: Stops,
+    rng: np.random.Generator,
+    workers: int = 1,
+    slant: float = 0.0,
 ) -> Tracks:
     """Experiment 2 with a new wall at each stop; the sequence of an observation is the number of its stop.
 

@@ -8,7 +8,8 @@ no estimate of a filter is used.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.bench.models import planar, point, stereo
 from consistency.bench.scenario import Belief, BelievedSensor
-from consistency.bench.store.log import Log
+from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
@@ -30,8 +31,7 @@ NEAREST = 0.5  # m, depth of a point that a fit may move behind the camera
 MAD = 1.4826  # standard deviation over median deviation, of a Gaussian
 
 
-@dataclass(frozen=True)
-class Screened:
+class Screened(NamedTuple):
     """Trials in which landmarks restart where they leave the common motion, and how often they do."""
 
     trials: list[Trial]
@@ -56,40 +56,70 @@ def screened(trials: Sequence[Trial], belief: Belief, gate: Array) -> Screened:
     """
     if belief.sensor.model == "linear":
         raise InputError("a log of a sensor 'linear' cannot be screened: it observes no points that move")
-    pairs = [_pairs(trial) for trial in trials]
-    misfits = [np.abs(_misfits(trial, *rows, belief, gate)) for trial, rows in zip(trials, pairs, strict=True)]
+    broken = []
+    misfits = []
+    for trial in trials:
+        before, after = _pairs(trial)
+        misfit = np.abs(_misfits(trial, before, after, belief, gate))
+        broken.append(after[(misfit > gate).any(axis=1)])
+        misfits.append(misfit)
     every = np.concatenate(misfits)
-    scale = MAD * np.median(every, axis=0) if len(every) else np.zeros(len(gate))
-    broken = [rows[1][(e > gate).any(axis=1)] for rows, e in zip(pairs, misfits, strict=True)]
+    scale = np.zeros(len(gate))
+    if len(every):
+        scale = MAD * np.median(every, axis=0)
     offered = sum(len(trial.z) for trial in trials)
-    return Screened(_begun_anew(trials, broken), scale, offered, len(every), sum(map(len, broken)))
+    return Screened(
+        _begun_anew(trials, broken),
+        scale,
+        offered=offered,
+        judged=len(every),
+        broken=sum(map(len, broken)),
+    )
 
 
 def _pairs(trial: Trial) -> tuple[Indices, Indices]:
     """Rows (n,) of observations, and of those of the same landmark in the step after; sorted by step."""
     step = trial.step - 1
     order = np.lexsort((step, trial.landmark))
-    follows = (np.diff(trial.landmark[order]) == 0) & (np.diff(step[order]) == 1)
-    before, after = order[:-1][follows], order[1:][follows]
+    same_landmark = np.diff(trial.landmark[order]) == 0
+    next_step = np.diff(step[order]) == 1
+    follows = same_landmark & next_step
+    before = order[:-1][follows]
+    after = order[1:][follows]
     by_step = np.argsort(step[after], kind="stable")
     return before[by_step], after[by_step]
 
 
-def _misfits(trial: Trial, before: Indices, after: Indices, belief: Belief, gate: Array) -> Array:
+def _misfits(
+    trial: Trial,
+    before: Indices,
+    after: Indices,
+    belief: Belief,
+    gate: Array,
+) -> Array:
     """Seen less expected (n, s) at the common motion of each step, over its standard deviation by leverage."""
     step = trial.step[after] - 1
-    out = np.empty((len(after), trial.z.shape[1]))
+    points = _points(trial.z[before], belief.sensor)
+    seen = trial.z[after]
+    out = np.empty_like(seen)
     for k in np.unique(step):
-        rows = np.flatnonzero(step == k)
+        rows = step == k
         dt, v, omega = trial.controls[k]
         mean = np.array([dt * v, 0.0, 0.0, 0.0, 0.0, dt * omega])
         noise = dt * np.repeat([belief.motion.sigma_v, belief.motion.sigma_omega], 3)
-        points, seen = _points(trial.z[before[rows]], belief.sensor), trial.z[after[rows]]
-        out[rows] = _misfit(points, seen, mean, np.hypot(noise, LOOSE), gate / GATE, belief.sensor)
+        sigma = np.hypot(noise, LOOSE)
+        out[rows] = _misfit(points[rows], seen[rows], mean, sigma, gate / GATE, belief.sensor)
     return out
 
 
-def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, scale: Array, sensor: BelievedSensor) -> Array:
+def _misfit(
+    points: Array,
+    seen: Array,
+    mean: Array,
+    sigma: Array,
+    scale: Array,
+    sensor: BelievedSensor,
+) -> Array:
     """Misfits (n, s) of points (n, 3) in the robot frame a step before, by reweighted least squares from the odometry.
 
     A fit takes after the observations that it rests on: a misfit is divided by sqrt(1 - leverage) (Cook & Weisberg
@@ -98,7 +128,8 @@ def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, scale: Array,
     move = mean.copy()
     for _ in range(STEPS):
         error, slope = _error_and_slope(points, seen, move, sensor)
-        weight = 1.0 / (1.0 + ((error / (SOFT * scale)) ** 2).sum(axis=1))
+        squared = ((error / (SOFT * scale)) ** 2).sum(axis=1)
+        weight = 1.0 / (1.0 + squared)
         J = slope / scale[:, None]
         normal = np.einsum("n,nij,nik->jk", weight, J, J) + np.diag(sigma**-2)
         right = np.einsum("n,nij,ni->j", weight, J, error / scale) + (mean - move) / sigma**2
@@ -106,15 +137,20 @@ def _misfit(points: Array, seen: Array, mean: Array, sigma: Array, scale: Array,
     error, slope = _error_and_slope(points, seen, move, sensor)
     J = slope / scale[:, None]
     leverage = weight[:, None] * np.einsum("nij,jk,nik->ni", J, np.linalg.inv(normal), J)
-    return np.asarray(error / np.sqrt(np.maximum(1.0 - leverage, 1e-3)))
+    return error / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
 
 
-def _error_and_slope(points: Array, seen: Array, move: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
+def _error_and_slope(
+    points: Array,
+    seen: Array,
+    move: Array,
+    sensor: BelievedSensor,
+) -> tuple[Array, Array]:
     """Seen less expected z (n, s), and the derivative (n, s, 6) of the expected by shift and rotation vector."""
     turn = Rotation.from_rotvec(move[3:]).as_matrix()
     moved = (points - move[:3]) @ turn
     expected, by_point = _expected(moved, sensor)
-    by_turn = np.cross(moved[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)
+    by_turn = np.cross(moved[:, None, :], np.eye(3)).transpose(0, 2, 1)
     by_move = np.concatenate([np.broadcast_to(-turn.T, by_turn.shape), by_turn], axis=2)
     error = seen - expected
     if sensor.model == "range-bearing":
@@ -125,15 +161,12 @@ def _error_and_slope(points: Array, seen: Array, move: Array, sensor: BelievedSe
 def _points(z: Array, sensor: BelievedSensor) -> Array:
     """Observations (n, s) as points in the robot frame (n, 3), m; those of a sensor in the plane have height 0."""
     if sensor.model == "uvd":
-        assert sensor.f is not None
-        assert sensor.B is not None
         u, v, d = z.T
-        at = stereo.triangulate(u, v, d, sensor.f, sensor.B)
+        at = stereo.triangulate(u, v, d, *sensor.rig)
     elif sensor.model == "range-bearing":
         at = *planar.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
     else:
-        x, y, height = np.pad(z, ((0, 0), (0, 3 - sensor.size))).T
-        at = x, y, height
+        at = tuple(np.pad(z, ((0, 0), (0, 3 - sensor.size))).T)
     return np.column_stack(point.from_sensor(*at, sensor.mount.packed()))
 
 
@@ -143,11 +176,9 @@ def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
     bx, by, bz = points.T
     x, y, z = point.to_sensor(bx, by, bz, mount)
     if sensor.model == "uvd":
-        assert sensor.f is not None
-        assert sensor.B is not None
         x = np.maximum(x, NEAREST)
-        seen = np.column_stack(stereo.project(x, y, z, sensor.f, sensor.B))
-        slope = np.array(stereo.project_jacobian(x, y, z, sensor.f, sensor.B)).reshape(3, 3, -1)
+        seen = np.column_stack(stereo.project(x, y, z, *sensor.rig))
+        slope = np.array(stereo.project_jacobian(x, y, z, *sensor.rig)).reshape(3, 3, -1)
     elif sensor.model == "range-bearing":
         seen = np.column_stack(planar.range_bearing(x, y))
         flat = np.array(planar.range_bearing_jacobian(x, y)).reshape(2, 2, -1)
@@ -165,8 +196,10 @@ def _begun_anew(trials: Sequence[Trial], broken: Sequence[Indices]) -> list[Tria
     The ids of landmarks stay what they are, new ones follow; then those of things that are not landmarks, likewise.
     """
     ids = max(trial.n_landmarks for trial in trials)
-    known = ids if trials[0].landmarks is None else len(trials[0].landmarks)
-    pieces = [_piece(trial, rows) for trial, rows in zip(trials, broken, strict=True)]
+    known = ids
+    if trials[0].landmarks is not None:
+        known = len(trials[0].landmarks)
+    pieces = list(map(_piece, trials, broken))
     count = np.ones(ids, np.int64)
     for trial, piece in zip(trials, pieces, strict=True):
         np.maximum.at(count, trial.landmark, piece + 1)
@@ -175,11 +208,11 @@ def _begun_anew(trials: Sequence[Trial], broken: Sequence[Indices]) -> list[Tria
     new = np.arange(len(parent)) != place[parent]
     order = np.lexsort((new, parent >= known))
     rank = np.argsort(order)
-    parent, new = parent[order], new[order]
-    return [
-        _renumbered(trial, rank[place[trial.landmark] + piece], parent, new)
-        for trial, piece in zip(trials, pieces, strict=True)
-    ]
+    again = []
+    for trial, piece in zip(trials, pieces, strict=True):
+        landmark = rank[place[trial.landmark] + piece]
+        again.append(_renumbered(trial, landmark, parent[order], new[order]))
+    return again
 
 
 def _piece(trial: Trial, broken: Indices) -> Indices:
@@ -193,13 +226,21 @@ def _piece(trial: Trial, broken: Indices) -> Indices:
     return out
 
 
-def _renumbered(trial: Trial, landmark: Indices, parent: Indices, new: Array) -> Trial:
+def _renumbered(
+    trial: Trial,
+    landmark: Indices,
+    parent: Indices,
+    new: Array,
+) -> Trial:
     """A trial with the ids ``landmark`` (M,) of its rows, each a ``new`` one or not, of ``parent`` in the trial."""
-    labels = np.arange(len(parent)) if trial.labels is None else trial.labels[parent]
+    labels = np.arange(len(parent))
+    if trial.labels is not None:
+        labels = trial.labels[parent]
     labels[new] = labels.max(initial=-1) + 1 + np.arange(new.sum())
-    source, places = trial.source, trial.landmarks
+    source = trial.source
     if source is not None:
         source = np.where(source == trial.landmark, landmark, source)
+    places = trial.landmarks
     if places is not None:
         places = places[parent[parent < len(places)]]
     return replace(trial, landmark=landmark, n_landmarks=len(parent), labels=labels, source=source, landmarks=places)
@@ -217,7 +258,7 @@ def screened_log(log: Log, gate: str | Array) -> Log:
     InputError
         ``gate`` is not one positive number for each value; the sensor is linear.
     """
-    values = _numbers(gate) if isinstance(gate, str) else gate
+    values = _numbers(gate)
     size = log.belief.sensor.size
     if values.shape != (size,) or not (np.isfinite(values) & (values > 0)).all():
         example = ",".join(["2", "2", "1"][:size])
@@ -225,28 +266,37 @@ def screened_log(log: Log, gate: str | Array) -> Log:
             f"--screen {gate}: must be {size} positive numbers for a sensor '{log.belief.sensor.model}', as {example}"
         )
     found = screened(log.trials, log.belief, values)
-    counts = {"offered": found.offered, "judged": found.judged, "broken": found.broken}
-    screening = {"gate": values.tolist(), "scale": found.scale.tolist()} | counts
-    landmarks, first = log.landmarks, found.trials[0]
+    screening = {
+        "gate": values.tolist(),
+        "scale": found.scale.tolist(),
+        "offered": found.offered,
+        "judged": found.judged,
+        "broken": found.broken,
+    }
+    landmarks = log.landmarks
+    first = found.trials[0]
     if landmarks is not None and first.landmarks is not None and first.labels is not None:
-        places = dict(zip("xyz", first.landmarks.T, strict=True))
-        seen = pd.DataFrame({"landmark": first.labels[: len(first.landmarks)]} | places)
-        landmarks = pd.concat([landmarks, seen]).drop_duplicates("landmark", ignore_index=True)
+        places = pd.DataFrame(first.landmarks, columns=["x", "y", "z"])
+        places.insert(0, "landmark", first.labels[: len(places)])
+        landmarks = pd.concat([landmarks, places]).drop_duplicates("landmark", ignore_index=True)
     return replace(log, trials=found.trials, landmarks=landmarks, screening=screening)
 
 
 def screening_line(log: Log) -> str:
     """What a screening found, for a terminal."""
     found = log.screening or {}
-    gate, scale = (", ".join(f"{value:.2g}" for value in found[name]) for name in ("gate", "scale"))
+    gate = ", ".join(f"{value:.2g}" for value in found["gate"])
+    scale = ", ".join(f"{value:.2g}" for value in found["scale"])
     return (
         f"screen: {found['broken']} of {found['judged']} observations that follow another of their landmark leave the "
         f"common motion by more than {gate}; a landmark restarts there (standard deviation of the rest: {scale})"
     )
 
 
-def _numbers(text: str) -> Array:
+def _numbers(gate: str | Array) -> Array:
+    if not isinstance(gate, str):
+        return gate
     try:
-        return np.array(text.split(","), float)
+        return np.array(gate.split(","), float)
     except ValueError:
         return np.zeros(0)

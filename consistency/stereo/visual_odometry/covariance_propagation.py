@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConvergenceError, DegenerateError
@@ -39,8 +40,8 @@ def implicit_covariance(C_yy: Array, C_yx: Array, S_x: Array) -> Array:
     inverse, definite = arrays.symmetric_inverses(C_yy)
     if not definite.all():
         raise DegenerateError("the cost has no minimum here: its second derivative is not positive definite")
-    S = inverse @ (_wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)) @ inverse
-    return np.asarray(0.5 * (S + np.swapaxes(S, -1, -2)))
+    S = _wide(C_yx @ S_x) @ np.swapaxes(_wide(C_yx), -1, -2)
+    return propagated(inverse, S)
 
 
 def _wide(blocks: Array) -> Array:
@@ -74,7 +75,12 @@ def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
     return implicit_covariance(C_pp, C_pu[:, None], S_uv[:, None])
 
 
-def triangulation_derivatives(rig: StereoRig, A: Array, b: Array, points: Array) -> tuple[Array, Array]:
+def triangulation_derivatives(
+    rig: StereoRig,
+    A: Array,
+    b: Array,
+    points: Array,
+) -> tuple[Array, Array]:
     """C_pp (N, 3, 3) and C_pu (N, 3, 4) of half of eq. 2.25.
 
     Row j of A p - b is (u_j P_3 - P_j) (p, 1), with P the rows of its camera: u_j stands in row j only, and its factor
@@ -83,11 +89,18 @@ def triangulation_derivatives(rig: StereoRig, A: Array, b: Array, points: Array)
     last = rig.cameras[:, 2].repeat(2, axis=0)  # (4, 4), P_3 of each row
     residual = np.einsum("nij,nj->ni", A, points) - b
     depth = points @ last[:, :3].T + last[:, 3]
-    C_pu = np.swapaxes(A * depth[:, :, None] + last[:, :3] * residual[:, :, None], 1, 2)
+    C_up = A * depth[:, :, None] + last[:, :3] * residual[:, :, None]
+    C_pu = np.swapaxes(C_up, 1, 2)
     return np.swapaxes(A, 1, 2) @ A, C_pu
 
 
-def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: RelativePose) -> Array:
+def registration_covariance(
+    p1: Array,
+    p2: Array,
+    S1: Array,
+    S2: Array,
+    pose: RelativePose,
+) -> Array:
     """Covariance of the minimum of eq. 2.28, eq. 2.29-2.31, with its exact derivatives.
 
     It holds for :func:`register_svd` and :func:`register_horn`, which both find that minimum.
@@ -112,12 +125,14 @@ def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: Re
         ``pose`` is not the minimum for these points.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
+    S1 = arrays.covariances("S1", S1, len(p1), 3)
+    S2 = arrays.covariances("S2", S2, len(p1), 3)
     C_d, C_dd, C_dp = registration_derivatives(p1, p2, pose)
     S = implicit_covariance(C_dd, C_dp, np.concatenate([S1, S2]))
     step = np.linalg.solve(C_dd, C_d)
     spread = np.sqrt(np.diagonal(S))
-    if (np.abs(step) > AT_MINIMUM * spread + 1e-9 * (1.0 + np.abs(pose.vector))).any():
+    rounding = 1e-9 * (1.0 + np.abs(pose.vector))
+    if (np.abs(step) > AT_MINIMUM * spread + rounding).any():
         raise ConvergenceError("pose: not the minimum of eq. 2.28 for p1 and p2; register these very points first")
     return S
 
@@ -125,18 +140,22 @@ def registration_covariance(p1: Array, p2: Array, S1: Array, S2: Array, pose: Re
 def registration_derivatives(p1: Array, p2: Array, pose: RelativePose) -> tuple[Array, Array, Array]:
     """C_d (6,), C_dd (6, 6) and C_dp (2N, 6, 3), first of p1 then of p2, of half of eq. 2.28."""
     first, second = rotation_derivatives(pose)
+    n = len(p1)
     residual = p1 - pose.apply(p2)
     turned = np.einsum("kij,nj->nki", first, p2)  # R_k p2
-    n = len(p1)
-    C_d = -np.concatenate([residual.sum(axis=0), np.einsum("ni,nki->k", residual, turned)])
+    flat = turned.transpose(1, 0, 2).reshape(3, -1)
+    C_d = np.empty(6)
+    C_d[:3] = -residual.sum(axis=0)
+    C_d[3:] = -np.einsum("ni,nki->k", residual, turned)
     C_dd = np.empty((6, 6))
     C_dd[:3, :3] = n * np.eye(3)
     C_dd[3:, :3] = turned.sum(axis=0)
     C_dd[:3, 3:] = C_dd[3:, :3].T
-    flat = turned.transpose(1, 0, 2).reshape(3, -1)
     C_dd[3:, 3:] = flat @ flat.T - np.einsum("klij,ij->kl", second, residual.T @ p2)
-    C_dp = np.empty((2 * n, 6, 3))
-    C_dp[:n, :3], C_dp[:n, 3:] = -np.eye(3), -turned
-    C_dp[n:, :3] = pose.R
-    C_dp[n:, 3:] = turned @ pose.R - np.einsum("kij,ni->nkj", first, residual)
-    return C_d, C_dd, C_dp
+    C_dp1 = np.empty((n, 6, 3))
+    C_dp1[:, :3] = -np.eye(3)
+    C_dp1[:, 3:] = -turned
+    C_dp2 = np.empty((n, 6, 3))
+    C_dp2[:, :3] = pose.R
+    C_dp2[:, 3:] = turned @ pose.R - np.einsum("kij,ni->nkj", first, residual)
+    return C_d, C_dd, np.concatenate([C_dp1, C_dp2])

@@ -5,7 +5,9 @@ Matches pass a ratio and a mutual test, an epipolar gate, and the circle over fo
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,15 +50,20 @@ def grey(image: Array, name: str = "image") -> Array:
     image = np.asarray(image)
     if image.dtype.kind not in "uif" or image.size == 0:
         raise InputError(f"{name}: is not an image, but an array of {image.dtype} with shape {image.shape}")
-    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (1, 3, 4))):
+    is_colour = image.ndim == 3 and image.shape[2] in (1, 3, 4)
+    if image.ndim != 2 and not is_colour:
         raise InputError(f"{name}: shape {image.shape}; an image is (h, w) or (h, w, 3)")
     if image.dtype == np.uint8 and image.ndim == 2:
         return np.ascontiguousarray(image)
-    values = image.astype(float) / (257.0 if image.dtype == np.uint16 else 1.0)
+    values = image.astype(float)
+    if image.dtype == np.uint16:
+        values /= 257.0
     if not np.isfinite(values).all():
         raise InputError(f"{name}: holds a pixel that is not a finite number")
-    if values.ndim == 3:
-        values = values[:, :, 0] if values.shape[2] == 1 else values[:, :, :3] @ GREY
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[:, :, 0]
+    elif values.ndim == 3:
+        values = values[:, :, :3] @ GREY
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
@@ -84,8 +91,7 @@ def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
     )
 
 
-@dataclass(frozen=True)
-class StereoFeatures:
+class StereoFeatures(NamedTuple):
     """Features of both images of a stereo pair and their matches, row by row of ``pairs``."""
 
     left: Features
@@ -93,7 +99,12 @@ class StereoFeatures:
     pairs: Indices  # (M, 2), rows in left and right; each feature at most once
 
 
-def mutual_matches(first: Array, second: Array, allowed: Array | None = None, ratio: float = RATIO) -> Indices:
+def mutual_matches(
+    first: Array,
+    second: Array,
+    allowed: Array | None = None,
+    ratio: float = RATIO,
+) -> Indices:
     """Rows (M, 2) of descriptors (N, k) and (K, k) that are each other's nearest, sorted by the first.
 
     Parameters
@@ -107,37 +118,49 @@ def mutual_matches(first: Array, second: Array, allowed: Array | None = None, ra
     likeness = np.asarray(first @ second.T)  # cosines
     if allowed is not None:
         likeness[~allowed] = NEVER
-    rows, best = np.arange(len(first)), likeness.argmax(axis=1)
+    rows = np.arange(len(first))
+    best = likeness.argmax(axis=1)
     nearest = likeness[rows, best]
     mutual = nearest == likeness.max(axis=0)[best]
     likeness[rows, best] = NEVER
-    further = likeness.max(axis=1)
-    near, far = (np.sqrt(np.maximum(2.0 - 2.0 * value, 0.0)) for value in (nearest, further))
+    near = _distances(nearest)
+    far = _distances(likeness.max(axis=1))
     good = (nearest > NEVER) & mutual & (near < ratio * far)
     good &= np.bincount(best[good], minlength=len(second))[best] == 1  # equal descriptors tell nothing
-    return np.asarray(np.column_stack([rows, best])[good], np.int64)
+    return np.column_stack([rows, best])[good]
 
 
-def epipolar_gate(rig: StereoRig, left: Array, right: Array, tolerance: float = EPIPOLAR_PX) -> Array:
+def _distances(cosines: Array) -> Array:
+    """Distances of descriptors of unit length."""
+    return np.sqrt(np.maximum(2.0 - 2.0 * cosines, 0.0))
+
+
+def epipolar_gate(
+    rig: StereoRig,
+    left: Array,
+    right: Array,
+    tolerance: float = EPIPOLAR_PX,
+) -> Array:
     """Whether pixels (N, 2) of the left and (K, 2) of the right image may show one point, shape (N, K).
 
     The right pixel lies within ``tolerance`` px of the epipolar line of the left one. In rectified images that
     is a difference of rows, and the right column must not exceed the left one by more than ``tolerance``.
     """
     lines = homogeneous(left) @ fundamental(rig).T  # (N, 3) in the right image
-    lines = lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    length = np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    lines = lines / np.maximum(length, 1e-12)
     distance = lines.astype(np.float32) @ homogeneous(right).T.astype(np.float32)
     near = np.abs(distance, out=distance) <= tolerance
     if is_rectified(rig):
         furthest = left[:, 0] - (rig.K_left[0, 2] - rig.K_right[0, 2]) + tolerance
         near &= furthest.astype(np.float32)[:, None] >= right[:, 0].astype(np.float32)
-    return np.asarray(near)
+    return near
 
 
 def fundamental(rig: StereoRig) -> Array:
     """F (3, 3) with x_right' F x_left = 0 for homogeneous pixels of one point, Hartley & Zisserman (2003) eq. 9.2."""
     cross = cross_matrix(-rig.R.T @ rig.t)
-    return np.asarray(np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left))
+    return np.linalg.inv(rig.K_right).T @ cross @ rig.R.T @ np.linalg.inv(rig.K_left)
 
 
 def homogeneous(uv: Array) -> Array:
@@ -146,29 +169,40 @@ def homogeneous(uv: Array) -> Array:
 
 
 def stereo_matches(
-    rig: StereoRig, left: Features, right: Features, ratio: float = RATIO, tolerance: float = EPIPOLAR_PX
+    rig: StereoRig,
+    left: Features,
+    right: Features,
+    ratio: float = RATIO,
+    tolerance: float = EPIPOLAR_PX,
 ) -> StereoFeatures:
     """Features of both images matched within the epipolar gate.
 
     Rectified images are matched in bands of rows. Around a band, the right features reach ``tolerance`` further and
     the left ones twice that, so that each left feature of the band and each right one it may match has all its rivals.
     """
-    height, step = (rig.image_size[1], BAND) if is_rectified(rig) else (1, 1)
     groups = [np.empty((0, 2), np.int64)]
-    for top in range(0, height, step):
-        ends = (-np.inf if top == 0 else top, np.inf if top + step >= height else top + step)
-        i, j = (_within(f.uv[:, 1], ends, margin * tolerance) for f, margin in ((left, 2), (right, 1)))
+    for low, high in _bands(rig):
+        i = _within(left.uv[:, 1], low - 2 * tolerance, high + 2 * tolerance)
+        j = _within(right.uv[:, 1], low - tolerance, high + tolerance)
         allowed = epipolar_gate(rig, left.uv[i], right.uv[j], tolerance)
         matches = mutual_matches(left.descriptors[i], right.descriptors[j], allowed, ratio)
         pairs = np.column_stack([i[matches[:, 0]], j[matches[:, 1]]])
-        row = left.uv[pairs[:, 0], 1]
-        groups.append(pairs[(row >= ends[0]) & (row < ends[1])])
+        of_band = _within(left.uv[:, 1], low, high)
+        groups.append(pairs[np.isin(pairs[:, 0], of_band)])
     pairs = np.concatenate(groups)
     return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
 
 
-def _within(values: Array, ends: tuple[float, float], margin: float) -> Indices:
-    return np.flatnonzero((values >= ends[0] - margin) & (values < ends[1] + margin))
+def _bands(rig: StereoRig) -> list[tuple[float, float]]:
+    """First row and the row behind the last of each band; one band of all rows where images are not rectified."""
+    edges = np.array([-np.inf, np.inf])
+    if is_rectified(rig):
+        edges = np.insert(edges, 1, np.arange(BAND, rig.image_size[1], BAND))
+    return list(itertools.pairwise(edges))
+
+
+def _within(values: Array, low: float, high: float) -> Indices:
+    return np.flatnonzero((values >= low) & (values < high))
 
 
 def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float = RATIO) -> Indices:
@@ -177,10 +211,13 @@ def circular_matches(before: StereoFeatures, after: StereoFeatures, ratio: float
     Left is matched with left and right with right over time, among features that have a stereo match; both must
     say the same. The two stereo matches of the circle are those of the pairs.
     """
-    codes = list[Indices]()
-    for side, (was, now) in enumerate(((before.left, after.left), (before.right, after.right))):
-        old, new = before.pairs[:, side], after.pairs[:, side]
-        i, j = mutual_matches(was.descriptors[old], now.descriptors[new], None, ratio).T
-        codes.append(i * len(new) + j)
-    closed = np.intersect1d(codes[0], codes[1], assume_unique=True)
-    return np.asarray(np.column_stack(np.divmod(closed, max(len(after.pairs), 1))), np.int64)
+    first = before.left.descriptors[before.pairs[:, 0]]
+    second = after.left.descriptors[after.pairs[:, 0]]
+    left = mutual_matches(first, second, ratio=ratio)
+    first = before.right.descriptors[before.pairs[:, 1]]
+    second = after.right.descriptors[after.pairs[:, 1]]
+    right = mutual_matches(first, second, ratio=ratio)
+    count = max(len(after.pairs), 1)
+    one_number = np.array([count, 1])  # for each match
+    closed = np.intersect1d(left @ one_number, right @ one_number, assume_unique=True)
+    return np.column_stack(np.divmod(closed, count))

@@ -40,7 +40,7 @@ SLACK = 1e-12  # relative rounding of the cost
 
 def threshold(dof: int) -> float:
     """Standardised residual c, of ``dof`` dimensions, that a point without fault exceeds with probability 0.05."""
-    return float(np.sqrt(stats.chi2.isf(TAIL, dof)))
+    return np.sqrt(stats.chi2.isf(TAIL, dof))
 
 
 def loss(robust: Robust | None, s: Array, c: float) -> tuple[Array, Array, Array]:
@@ -55,11 +55,13 @@ def loss(robust: Robust | None, s: Array, c: float) -> tuple[Array, Array, Array
         return s, np.ones_like(s), np.zeros_like(s)
     if robust == "huber":
         far = np.maximum(s, c**2)
-        root = c / np.sqrt(far)
-        return np.minimum(s, c**2) + 2.0 * c * (np.sqrt(far) - c), root, np.where(s > c**2, -0.5 * root / far, 0.0)
+        weight = c / np.sqrt(far)
+        rho = np.minimum(s, c**2) + 2.0 * c * (np.sqrt(far) - c)
+        return rho, weight, np.where(s > c**2, -0.5 * weight / far, 0.0)
     if robust == "cauchy":
         weight = 1.0 / (1.0 + s / c**2)
-        return c**2 * np.log1p(s / c**2), weight, -(weight**2) / c**2
+        rho = c**2 * np.log1p(s / c**2)
+        return rho, weight, -(weight**2) / c**2
     raise InputError(f"robust: {robust!r}, allowed are 'huber', 'cauchy' and None")
 
 
@@ -85,7 +87,13 @@ class Refined:
 
 
 def register_weighted(
-    p1: Array, p2: Array, S1: Array, S2: Array, pose: RelativePose | None = None, *, robust: Robust | None = None
+    p1: Array,
+    p2: Array,
+    S1: Array,
+    S2: Array,
+    pose: RelativePose | None = None,
+    *,
+    robust: Robust | None = None,
 ) -> Refined:
     """Minimum of the sum of e' (S1 + R S2 R')^-1 e with e = p1 - (R p2 + t).
 
@@ -112,7 +120,8 @@ def register_weighted(
         No minimum was reached.
     """
     p1, p2 = checked_clouds(p1, p2)
-    S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
+    S1 = arrays.covariances("S1", S1, len(p1), 3)
+    S2 = arrays.covariances("S2", S2, len(p1), 3)
     frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
     return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
 
@@ -147,10 +156,13 @@ def refine_reprojection(
     InputError, DegenerateError, GimbalLockError, ConvergenceError
         As :func:`register_weighted`.
     """
-    uv1, uv2 = arrays.checked_rows("uv1", uv1, 4), arrays.checked_rows("uv2", uv2, 4)
+    uv1 = arrays.checked_rows("uv1", uv1, 4)
+    uv2 = arrays.checked_rows("uv2", uv2, 4)
     arrays.same_length("uv1, uv2", uv1, uv2)
     S1 = arrays.covariances("S_uv", S_uv, len(uv1), 4)
-    S2 = S1 if S_uv2 is None else arrays.covariances("S_uv2", S_uv2, len(uv1), 4)
+    S2 = S1
+    if S_uv2 is not None:
+        S2 = arrays.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = checked_clouds(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
     frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
@@ -159,7 +171,9 @@ def refine_reprojection(
 
 def _weights(name: str, S: Array) -> Array:
     """Inverse covariances; those given once for all rows are inverted once."""
-    once = S[:1] if S.strides[0] == 0 else S
+    once = S
+    if S.strides[0] == 0:
+        once = S[:1]
     try:
         root = np.linalg.inv(np.linalg.cholesky(once))
     except np.linalg.LinAlgError:
@@ -167,7 +181,14 @@ def _weights(name: str, S: Array) -> Array:
     return np.broadcast_to(np.swapaxes(root, 1, 2) @ root, S.shape)
 
 
-def _refined(frames: TwoFrames, S1: Array, S2: Array, pose: RelativePose, q: Array, robust: Robust | None) -> Refined:
+def _refined(
+    frames: TwoFrames,
+    S1: Array,
+    S2: Array,
+    pose: RelativePose,
+    q: Array,
+    robust: Robust | None,
+) -> Refined:
     free = 2 * frames.z1.shape[1] - 3  # of a point's residual, its position eliminated
     c = threshold(free)
     pose, q = _minimum(frames, pose, q, robust, c)
@@ -186,27 +207,35 @@ def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
         raise DegenerateError(f"match {k}: its point is not fixed by the images; leave it out", k)
     gain = f.dq @ inverse  # (N, 6, 3)
     dd = f.dd - gain @ np.swapaxes(f.dq, 1, 2)
-    dz1, dz2 = f.dz1 - gain @ f.qz1, -gain @ f.qz2
-    w, b = weight[:, None, None], 2.0 * bend[:, None, None]
-    d = f.d[:, :, None]
-    C_dd = (w * dd + b * d @ np.swapaxes(d, 1, 2)).sum(axis=0)
-    return C_dd, np.concatenate([w * dz1 + b * d @ f.z1[:, None], w * dz2 + b * d @ f.z2[:, None]])
+    w = weight[:, None, None]
+    bent = 2.0 * bend[:, None, None] * f.d[:, :, None]  # (N, 6, 1)
+    C_dd = (w * dd + bent @ f.d[:, None]).sum(axis=0)
+    C_dz1 = w * (f.dz1 - gain @ f.qz1) + bent @ f.z1[:, None]
+    C_dz2 = w * (-gain @ f.qz2) + bent @ f.z2[:, None]
+    return C_dd, np.concatenate([C_dz1, C_dz2])
 
 
 def _minimum(
-    frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
+    frames: TwoFrames,
+    pose: RelativePose,
+    q: Array,
+    robust: Robust | None,
+    c: float,
 ) -> tuple[RelativePose, Array]:
     """Levenberg and Marquardt on pose and points, and Newton's steps near the minimum."""
-    damping, newton = 0.0, False
+    damping = 0.0
+    newton = False
     cost, weight, bend = _cost(frames, pose, q, robust, c)
     for _ in range(STEPS):
         f = cost_derivatives(frames, pose, q, exact=newton)
         while True:
-            step, step_q, decrement = _step(f, weight, bend if newton else 0.0 * bend, damping)
+            step, step_q, decrement = _step(f, weight, bend * newton, damping)
             if newton and not decrement >= 0.0:
-                newton, f = False, cost_derivatives(frames, pose, q, exact=False)
+                newton = False
+                f = cost_derivatives(frames, pose, q, exact=False)
                 continue
-            there, q_there = RelativePose.from_vector(pose.vector + step), q + step_q
+            there = RelativePose.from_vector(pose.vector + step)
+            q_there = q + step_q
             if decrement < DECREMENT and damping < 1.0:
                 return there, q_there
             reached, *losses = _cost(frames, there, q_there, robust, c)
@@ -215,33 +244,53 @@ def _minimum(
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e12:
                 raise ConvergenceError("pose: no step lowers the cost; start nearer, or take the outliers out first")
-        pose, q, cost, (weight, bend) = there, q_there, reached, losses
-        damping, newton = 0.1 * damping if damping > 1e-8 else 0.0, decrement < NEAR
+        pose = there
+        q = q_there
+        cost = reached
+        weight, bend = losses
+        newton = decrement < NEAR
+        if damping > 1e-8:
+            damping *= 0.1
+        else:
+            damping = 0.0
     raise ConvergenceError(f"pose: no minimum in {STEPS} steps; start nearer, or take the outliers out first")
 
 
 def _cost(
-    frames: TwoFrames, pose: RelativePose, q: Array, robust: Robust | None, c: float
+    frames: TwoFrames,
+    pose: RelativePose,
+    q: Array,
+    robust: Robust | None,
+    c: float,
 ) -> tuple[float, Array, Array]:
     rho, weight, bend = loss(robust, frames.squared(pose, q), c)
-    return 0.5 * float(rho.sum()), weight, bend
+    return 0.5 * rho.sum(), weight, bend
 
 
-def _step(f: Derivatives, weight: Array, bend: Array, damping: float) -> tuple[Array, Array, float]:
+def _step(
+    f: Derivatives,
+    weight: Array,
+    bend: Array,
+    damping: float,
+) -> tuple[Array, Array, float]:
     """Step of the pose (6,) and of the points (N, 3), and twice the decrease that it predicts; NaN: not downhill."""
-    dd, qq = f.dd, f.qq
+    dd = f.dd
+    qq = f.qq
     if damping:
-        dd, qq = dd * (1.0 + damping * np.eye(6)), qq * (1.0 + damping * np.eye(3))
+        dd = dd * (1.0 + damping * np.eye(6))
+        qq = qq * (1.0 + damping * np.eye(3))
     inverse, definite = arrays.symmetric_inverses(qq)
     gain = f.dq @ inverse
-    g = f.d - (gain @ f.q[:, :, None])[:, :, 0]
-    H = np.dot(weight[None], (dd - gain @ np.swapaxes(f.dq, 1, 2)).reshape(-1, 36)).reshape(6, 6)
+    g = f.d - np.einsum("nij,nj->ni", gain, f.q)
+    H = np.tensordot(weight, dd - gain @ np.swapaxes(f.dq, 1, 2), 1)
     H += 2.0 * (g.T * bend) @ g
     try:
         np.linalg.cholesky(H)
         step = -np.linalg.solve(H, weight @ g)
     except np.linalg.LinAlgError:
         return np.zeros(6), np.zeros(f.q.shape), np.nan
-    step_q = -(inverse @ (f.q + step @ f.dq)[:, :, None])[:, :, 0]
-    slope = float(step @ (weight @ f.d) + weight @ (step_q * f.q).sum(axis=1))
-    return step, step_q, -slope if definite.all() else np.nan
+    step_q = -np.einsum("nij,nj->ni", inverse, f.q + step @ f.dq)
+    if not definite.all():
+        return step, step_q, np.nan
+    slope = step @ (weight @ f.d) + weight @ (step_q * f.q).sum(axis=1)
+    return step, step_q, -slope

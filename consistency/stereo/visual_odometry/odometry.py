@@ -5,12 +5,12 @@ Motions that the images do not tell are bridged from the motions around them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Sequence
 
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.relative_motion import (
@@ -20,14 +20,14 @@ from consistency.stereo.visual_odometry.relative_motion import (
     stereo_features,
 )
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, angular, cross_matrix
-from consistency.stereo.visual_odometry.sequence import Sequence
+from consistency.stereo.visual_odometry.sequence import StereoSequence
 
 FULL, FEWEST = 12, 3  # motions beside which a bridge was tried, for a covariance (6, 6), and for variances alone
 MOST = 0.5  # of the motions may be missing
 
 
 def visual_odometry(
-    sequence: Sequence, *, rng: np.random.Generator, settings: MotionSettings | None = None
+    sequence: StereoSequence, *, rng: np.random.Generator, settings: MotionSettings | None = None
 ) -> list[RelativeMotion]:
     """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
 
@@ -39,16 +39,18 @@ def visual_odometry(
     InputError
         An image that cannot be read; too few motions could be measured.
     """
-    rig, motions = sequence.rectification.rig, list[RelativeMotion | InputError]()
+    settings = settings or MotionSettings()
+    rig = sequence.rectification.rig
+    motions = list[RelativeMotion | InputError]()
     with progress(sequence.folder.name, len(sequence), "stereo pairs") as advance:
         before = None
-        for frame in range(len(sequence)):
-            name = sequence.left[frame].name
-            after = stereo_features(rig, *sequence.pair(frame), settings=settings, name=name)
+        names = ("", "")
+        for frame, path in enumerate(sequence.left):
+            names = (names[1], path.name)
+            after = stereo_features(rig, *sequence.pair(frame), settings, path.name)
             if before is not None:
-                names = (sequence.left[frame - 1].name, name)
                 try:
-                    motions.append(motion_between(rig, before, after, rng=rng, settings=settings, names=names))
+                    motions.append(motion_between(rig, before, after, settings, rng, names))
                 except InputError as fault:
                     motions.append(fault)
             before = after
@@ -56,7 +58,7 @@ def visual_odometry(
     return bridged(motions, sequence.t)
 
 
-def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
+def trajectory(motions: Sequence[RelativeMotion]) -> tuple[Array, Array, Array]:
     """Poses of the left camera in its first frame, and covariances to first order.
 
     The errors of the motions are taken as independent. Two in a row share the pixels of a frame, with opposite signs:
@@ -71,22 +73,25 @@ def trajectory(motions: Ordered[RelativeMotion]) -> tuple[Array, Array, Array]:
         convention so3 of ``consistency.referee.geometry.conventions``), m and rad; 0 for the first pose. Rotation
         vectors have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
     """
-    R, t, P = [np.eye(3)], [np.zeros(3)], [np.zeros((6, 6))]
+    R = [np.eye(3)]
+    t = [np.zeros(3)]
+    P = [np.zeros((6, 6))]
     for motion in motions:
         # p + R dt and R dR, with errors dp + dtheta x (R dt) + R d(dt) and dtheta + R d(phi)
         arm = R[-1] @ motion.pose.t
-        F, G = np.eye(6), np.zeros((6, 6))
+        F = np.eye(6)
         F[:3, 3:] = -cross_matrix(arm)
-        G[:3, :3], G[3:, 3:] = R[-1], R[-1] @ angular(motion.pose)
-        grown = F @ P[-1] @ F.T + G @ motion.covariance @ G.T
-        P.append(0.5 * (grown + grown.T))
+        G = np.zeros((6, 6))
+        G[:3, :3] = R[-1]
+        G[3:, 3:] = R[-1] @ angular(motion.pose)
+        P.append(propagated(F, P[-1]) + propagated(G, motion.covariance))
         t.append(t[-1] + arm)
         U, _, Vt = np.linalg.svd(R[-1] @ motion.pose.R)
         R.append(U @ Vt)
     return np.array(R), np.array(t), np.array(P)
 
 
-def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
+def motion_covariances(motions: Sequence[RelativeMotion]) -> Array:
     """Covariances (T, 6, 6) of the motions, of position and rotation vector in the frame that each begins in.
 
     Error convention so3 of ``consistency.referee.geometry.conventions``, m and rad.
@@ -97,7 +102,7 @@ def motion_covariances(motions: Ordered[RelativeMotion]) -> Array:
     return propagated(G, np.array([motion.covariance for motion in motions]))
 
 
-def bridged(found: Ordered[RelativeMotion | InputError], t: Array) -> list[RelativeMotion]:
+def bridged(found: Sequence[RelativeMotion | InputError], t: Array) -> list[RelativeMotion]:
     """All motions of a sequence, where those that could not be measured keep to their neighbours' velocity.
 
     Between two measured motions the six numbers of the pose are interpolated, before the first and after the last one
@@ -117,33 +122,54 @@ def bridged(found: Ordered[RelativeMotion | InputError], t: Array) -> list[Relat
     InputError
         More than half of the motions are missing, or too few are left to tell how well a bridge holds.
     """
-    good = np.array([isinstance(each, RelativeMotion) for each in found], bool)
-    faults = {k: each for k, each in enumerate(found) if isinstance(each, InputError)}
-    measured = [each for each in found if isinstance(each, RelativeMotion)]
+    motions: list[RelativeMotion] = []
+    faults: dict[int, InputError] = {}
+    for k, each in enumerate(found):
+        if isinstance(each, InputError):
+            faults[k] = each
+        else:
+            motions.append(each)
     if not faults:
-        return measured
+        return motions
     first = next(iter(faults.values()))
     if len(found) == 1:
         raise first
     if len(faults) > MOST * len(found):
         raise type(first)(f"{len(faults)} of {len(found)} motions could not be measured; the first: {first}")
+    good = np.ones(len(found), bool)
+    good[list(faults)] = False
     dt = np.diff(t)
     speed = np.full((len(found), 6), np.nan)  # of the numbers of the pose
-    speed[good] = np.array([m.pose.vector for m in measured]) / dt[good, None]
-    motions = dict(zip(np.flatnonzero(good).tolist(), measured, strict=True))
+    speed[good] = np.array([motion.pose.vector for motion in motions]) / dt[good, None]
     for k, fault in faults.items():
         around, share = neighbours(good, t, k)
         missed = _missed(speed, around - k, share)
         if len(missed) < FEWEST:
             raise type(fault)(f"{fault} (too few motions around it were measured to bridge it)")
         P = missed.T @ missed / len(missed)
-        P = np.diag(np.diag(P)) if len(missed) < FULL else P
+        if len(missed) < FULL:
+            P = np.diag(np.diag(P))
         pose = RelativePose.from_vector(dt[k] * (share @ speed[around]))
-        none, rows = np.empty((0, 4)), np.empty((0, 2), np.int64)
-        motions[k] = RelativeMotion(
-            pose, dt[k] ** 2 * P, np.empty(0, bool), 0.0, 0, none, none, none, none, rows, str(fault)
-        )
-    return [motions[k] for k in range(len(found))]
+        motions.insert(k, _bridge(pose, dt[k] ** 2 * P, str(fault)))
+    return motions
+
+
+def _bridge(pose: RelativePose, covariance: Array, fault: str) -> RelativeMotion:
+    """A motion without matches."""
+    none = np.empty((0, 4))
+    return RelativeMotion(
+        pose,
+        covariance,
+        inliers=np.empty(0, bool),
+        chi2=0.0,
+        dof=0,
+        uv0=none,
+        uv1=none,
+        sigma0=none,
+        sigma1=none,
+        rows=np.empty((0, 2), np.int64),
+        fault=fault,
+    )
 
 
 def neighbours(good: Array, t: Array, k: int) -> tuple[Indices, Array]:
@@ -154,13 +180,19 @@ def neighbours(good: Array, t: Array, k: int) -> tuple[Indices, Array]:
     if len(around) == 1:
         return around, np.ones(1)
     middle = 0.5 * (t[1:] + t[:-1])
-    share = (middle[k] - middle[around[0]]) / (middle[around[1]] - middle[around[0]])
+    before, after = middle[around]
+    share = (middle[k] - before) / (after - before)
     return around, np.array([1.0 - share, share])
 
 
 def _missed(speed: Array, offsets: Indices, share: Array) -> Array:
     """By how much a measured velocity differs from that of the motions at ``offsets`` from it, (n, 6)."""
     T = len(speed)
-    at = np.arange(max(0, -offsets.min()), min(T, T - offsets.max()))
-    missed = speed[at] - sum(part * speed[at + offset] for part, offset in zip(share, offsets, strict=True))
-    return np.asarray(missed[np.isfinite(missed).all(axis=1)])
+    first = max(0, -offsets.min())
+    last = min(T, T - offsets.max())
+    at = np.arange(first, last)
+    expected = np.zeros((len(at), 6))
+    for part, offset in zip(share, offsets, strict=True):
+        expected += part * speed[at + offset]
+    missed = speed[at] - expected
+    return missed[np.isfinite(missed).all(axis=1)]

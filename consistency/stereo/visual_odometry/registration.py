@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, DegenerateError
-from consistency.stereo.visual_odometry.relative_pose import RelativePose
+from consistency.stereo.visual_odometry.relative_pose import AXES, RelativePose
 
 ON_A_LINE = 1e-8  # second singular value of a cloud, over its largest coordinate, up to which it is a line
 AMBIGUOUS = 1e-14  # gap to the second-best rotation, relative, that is rounding
@@ -74,28 +74,37 @@ def register_horn(p1: Array, p2: Array, *, directions: bool = False) -> Relative
     """
     p1, p2 = checked_clouds(p1, p2)
     if directions:
-        length1, length2 = (np.linalg.norm(p, axis=1, keepdims=True) for p in (p1, p2))
-        if min(length1.min(), length2.min()) == 0.0:
-            raise DegenerateError("p1, p2: a point at the camera has no direction; leave it out")
-        v1, v2 = p1 / length1, p2 / length2
+        v1 = _directions(p1)
+        v2 = _directions(p2)
     else:
-        v1, v2 = p1 - p1.mean(axis=0), p2 - p2.mean(axis=0)
-    b, c = v2 + v1, v2 - v1
+        v1 = p1 - p1.mean(axis=0)
+        v2 = p2 - p2.mean(axis=0)
+    b = v2 + v1
+    c = v2 - v1
     B_i = np.zeros((len(p1), 4, 4))
-    B_i[:, 0, 1:], B_i[:, 1:, 0] = -c, c
-    B_i[:, 1, 2], B_i[:, 1, 3], B_i[:, 2, 3] = b[:, 2], -b[:, 1], b[:, 0]
-    B_i[:, 2, 1], B_i[:, 3, 1], B_i[:, 3, 2] = -b[:, 2], b[:, 1], -b[:, 0]
+    B_i[:, 0, 1:] = -c
+    B_i[:, 1:, 0] = c
+    B_i[:, 1:, 1:] = -np.tensordot(b, AXES, 1)  # -[b]x
     B = np.einsum("nij,nkj->ik", B_i, B_i)
     values, vectors = np.linalg.eigh(B)
-    _require_unique(float((values[1] - values[0]) / values[3]))
+    _require_unique((values[1] - values[0]) / values[3])
     scalar, *vector = vectors[:, 0]
     R = Rotation.from_quat([*vector, scalar]).as_matrix()
     return RelativePose(R, p1.mean(axis=0) - R @ p2.mean(axis=0))
 
 
+def _directions(points: Array) -> Array:
+    """Unit vectors (N, 3) from the camera."""
+    length = np.linalg.norm(points, axis=1, keepdims=True)
+    if length.min() == 0.0:
+        raise DegenerateError("p1, p2: a point at the camera has no direction; leave it out")
+    return points / length
+
+
 def checked_clouds(p1: Array, p2: Array) -> tuple[Array, Array]:
     """Both clouds as floats, (N, 3) and (N, 3), checked: errors as :func:`register_svd`."""
-    p1, p2 = arrays.checked_rows("p1", p1, 3), arrays.checked_rows("p2", p2, 3)
+    p1 = arrays.checked_rows("p1", p1, 3)
+    p2 = arrays.checked_rows("p2", p2, 3)
     arrays.same_length("p1, p2", p1, p2)
     if len(p1) < 3:
         raise DegenerateError(f"p1, p2: {len(p1)} points, a rigid motion needs at least 3")
@@ -122,14 +131,18 @@ def rigid_motions(p1: Array, p2: Array) -> tuple[Array, Array, Array]:
     -------
     R (..., 3, 3), t (..., 3) in m, and how well the rotation is fixed (...), 0 for points on a line to 1
     """
-    c1, c2 = p1.mean(axis=-2), p2.mean(axis=-2)
-    M = np.swapaxes(p1 - c1[..., None, :], -1, -2) @ (p2 - c2[..., None, :])
+    c1 = p1.mean(axis=-2)
+    c2 = p2.mean(axis=-2)
+    centred1 = p1 - c1[..., None, :]
+    centred2 = p2 - c2[..., None, :]
+    M = np.swapaxes(centred1, -1, -2) @ centred2
     U, s, Vt = np.linalg.svd(M)
     sign = np.where(np.linalg.det(U @ Vt) < 0.0, -1.0, 1.0)
-    U = np.concatenate([U[..., :2], U[..., 2:] * sign[..., None, None]], axis=-1)
+    U[..., 2] *= sign[..., None]
     R = U @ Vt
     t = c1 - (R @ c2[..., None])[..., 0]
-    fixed = (s[..., 1] + sign * s[..., 2]) / np.maximum(s[..., 0], np.finfo(float).tiny)
+    largest, second, third = np.moveaxis(s, -1, 0)
+    fixed = (second + sign * third) / np.maximum(largest, np.finfo(float).tiny)
     return R, t, fixed
 
 
@@ -174,24 +187,26 @@ def register_ransac(
     if (S1 is None) != (S2 is None):
         raise InputError("S1, S2: give both covariances or none")
     if S1 is not None and S2 is not None:
-        S1, S2 = arrays.covariances("S1", S1, len(p1), 3), arrays.covariances("S2", S2, len(p1), 3)
-    least = fewest(len(p1)) if minimum is None else minimum
+        S1 = arrays.covariances("S1", S1, len(p1), 3)
+        S2 = arrays.covariances("S2", S2, len(p1), 3)
+    if minimum is None:
+        minimum = fewest(len(p1))
 
     def inliers_of(R: Array, t: Array) -> Array:
         return squared_distances(p1, p2, R, t, S1, S2) <= threshold**2
 
     best = _search(p1, p2, inliers_of, rng)
     for _ in range(REFITS):
-        if best.sum() < max(3, least):
+        if best.sum() < max(3, minimum):
             break
         R, t, _ = rigid_motions(p1[best], p2[best])
         again = inliers_of(R, t)
         if again.sum() < best.sum() or (again == best).all():
             break
         best = again
-    if best.sum() < max(3, least):
+    if best.sum() < max(3, minimum):
         raise ConsensusError(
-            f"p1, p2: {int(best.sum())} of {len(p1)} points agree on a motion within {threshold:g}, at least {least} "
+            f"p1, p2: {int(best.sum())} of {len(p1)} points agree on a motion within {threshold:g}, at least {minimum} "
             "must; look at the matches, or allow a larger threshold"
         )
     return register_svd(p1[best], p2[best]), best
@@ -205,11 +220,23 @@ def fewest(points: int) -> int:
 def draws_for(share: float, most: int) -> float:
     """Draws of three until one is of inliers only with :data:`CONFIDENCE`, by their share; ``most`` at most."""
     clean = share**3  # probability that a draw has inliers only
-    return min(most, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12))) if clean > 0.0 else float(most)
+    if clean == 0.0:
+        return most
+    return min(most, np.log1p(-CONFIDENCE) / np.log1p(-min(clean, 1.0 - 1e-12)))
+
+
+def draw_triples(rng: np.random.Generator, draws: int, points: int) -> Indices:
+    """Rows (draws, 3) of three different points each."""
+    return rng.random((draws, points)).argpartition(2, axis=1)[:, :3]
 
 
 def squared_distances(
-    p1: Array, p2: Array, R: Array, t: Array, S1: Array | None = None, S2: Array | None = None
+    p1: Array,
+    p2: Array,
+    R: Array,
+    t: Array,
+    S1: Array | None = None,
+    S2: Array | None = None,
 ) -> Array:
     """||p1 - (R p2 + t)||^2, or with covariances its Mahalanobis form under S1 + R S2 R'.
 
@@ -225,26 +252,33 @@ def squared_distances(
     """
     residual = p1 - p2 @ np.swapaxes(R, -1, -2) - t[..., None, :]
     if S1 is None or S2 is None:
-        return np.asarray(np.einsum("...i,...i->...", residual, residual))
+        return np.einsum("...i,...i->...", residual, residual)
     R = R[..., None, :, :]
     S = S1 + R @ S2 @ np.swapaxes(R, -1, -2)
     try:
         scaled = np.linalg.solve(S, residual[..., None])[..., 0]
     except np.linalg.LinAlgError:
         raise InputError("S1, S2: singular together; a point needs noise in every direction to be judged by") from None
-    return np.asarray(np.einsum("...i,...i->...", residual, scaled))
+    return np.einsum("...i,...i->...", residual, scaled)
 
 
-def _search(p1: Array, p2: Array, inliers_of: Callable[[Array, Array], Array], rng: np.random.Generator) -> Array:
+def _search(
+    p1: Array,
+    p2: Array,
+    inliers_of: Callable[[Array, Array], Array],
+    rng: np.random.Generator,
+) -> Array:
     """Inliers (N,) of the best of adaptively many draws."""
-    best, draws, needed = np.zeros(len(p1), bool), 0, float(MOST)
+    best = np.zeros(len(p1), bool)
+    draws = 0
+    needed: float = MOST
     while draws < needed:
-        triples = rng.random((ROUND, len(p1))).argpartition(2, axis=1)[:, :3]
+        triples = draw_triples(rng, ROUND, len(p1))
         R, t, fixed = rigid_motions(p1[triples], p2[triples])
         inliers = inliers_of(R, t) & (fixed > FIXED)[:, None]
         first = inliers[np.argmax(inliers.sum(axis=1))]
         if first.sum() > best.sum():
             best = first
         draws += ROUND
-        needed = draws_for(float(best.mean()), MOST)
+        needed = draws_for(best.mean(), MOST)
     return best

@@ -10,6 +10,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
+from consistency.stereo.visual_odometry.cameras.camera_pair import in_px
 from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, MatchError
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import registration_covariance, triangulation_covariance
@@ -27,7 +28,12 @@ from consistency.stereo.visual_odometry.features import (
 from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection
 from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
-from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
+from consistency.stereo.visual_odometry.resection import (
+    diagonal_covariances,
+    inliers_within,
+    resect_ransac,
+    squared_reprojections,
+)
 
 ESTIMATORS = ("reprojection", "svd", "horn")
 FEWEST = 8  # closed circles; below, RANSAC would agree with anything
@@ -134,19 +140,17 @@ def relative_motion(
         The matches do not agree on a motion, or do not fix one; all are InputErrors.
     """
     settings = settings or MotionSettings()
-    frames = [
-        stereo_features(rig, *pair, settings=settings, name=name)
-        for pair, name in ((before, "before"), (after, "after"))
-    ]
-    motion = motion_between(rig, *frames, rng=rng, settings=settings, estimator=estimator)
+    if estimator is not None:
+        settings = replace(settings, estimator=estimator)
+    first = stereo_features(rig, *before, settings, "before")
+    second = stereo_features(rig, *after, settings, "after")
+    motion = motion_between(rig, first, second, settings, rng, ("before", "after"))
     if motion.doubt:
         warnings.warn(motion.doubt, stacklevel=2)
     return motion
 
 
-def stereo_features(
-    rig: StereoRig, left: Array, right: Array, settings: MotionSettings | None = None, name: str = "pair"
-) -> StereoFeatures:
+def stereo_features(rig: StereoRig, left: Array, right: Array, settings: MotionSettings, name: str) -> StereoFeatures:
     """Features and stereo matches of a pair of images (h, w): what a sequence keeps for the next motion.
 
     Raises
@@ -154,53 +158,57 @@ def stereo_features(
     InputError
         As :func:`relative_motion`.
     """
-    settings = settings or MotionSettings()
-    images = [grey(image, f"{name} {side}") for image, side in ((left, "left"), (right, "right"))]
-    for image, side in zip(images, ("left", "right"), strict=True):
-        if image.shape[::-1] != rig.image_size:
-            found, wanted = (f"{width} x {height} px" for width, height in (image.shape[::-1], rig.image_size))
-            raise InputError(f"{name} {side}: has {found}, but the rig is for {wanted}")
+    left = _grey_of_rig(rig, left, f"{name} left")
+    right = _grey_of_rig(rig, right, f"{name} right")
     with ThreadPoolExecutor(2) as pool:  # OpenCV holds no lock, and uses a core and a half of its own accord
-        one, two = pool.map(lambda image: sift(image, settings.features, name), images)
-    return stereo_matches(rig, one, two, settings.ratio, settings.epipolar_px)
+        one = pool.submit(sift, left, settings.features, name)
+        two = pool.submit(sift, right, settings.features, name)
+    return stereo_matches(rig, one.result(), two.result(), settings.ratio, settings.epipolar_px)
+
+
+def _grey_of_rig(rig: StereoRig, image: Array, name: str) -> Array:
+    image = grey(image, name)
+    if image.shape[::-1] != rig.image_size:
+        raise InputError(f"{name}: has {in_px(image.shape[::-1])}, but the rig is for {in_px(rig.image_size)}")
+    return image
 
 
 def motion_between(
     rig: StereoRig,
     before: StereoFeatures,
     after: StereoFeatures,
-    *,
+    settings: MotionSettings,
     rng: np.random.Generator,
-    settings: MotionSettings | None = None,
-    estimator: str | None = None,
-    names: tuple[str, str] = ("before", "after"),
+    names: tuple[str, str],
 ) -> RelativeMotion:
     """:func:`relative_motion` from features that are there already; errors call the pairs by ``names``."""
-    settings = settings or MotionSettings()
-    if estimator is not None:
-        settings = replace(settings, estimator=estimator)
     rows = circular_matches(before, after, settings.ratio)
-    uv0, uv1 = pixels(before)[rows[:, 0]], pixels(after)[rows[:, 1]]
+    uv0 = pixels(before)[rows[:, 0]]
+    uv1 = pixels(after)[rows[:, 1]]
     near = usable(rig, uv0, settings.min_disparity) & usable(rig, uv1, settings.min_disparity)
-    rows, uv0, uv1 = rows[near], uv0[near], uv1[near]
+    rows = rows[near]
+    uv0 = uv0[near]
+    uv1 = uv1[near]
+    pair = f"{names[0]} to {names[1]}"
     if len(rows) < FEWEST:
         raise ConsensusError(
-            f"{names[0]} to {names[1]}: {len(rows)} matches through all four images, at least {FEWEST} are needed; do "
-            "the pairs show the same scene, and is the left image the left one?"
+            f"{pair}: {len(rows)} matches through all four images, at least {FEWEST} are needed; do the pairs show the "
+            "same scene, and is the left image the left one?"
         )
-    sigma0, sigma1 = (pixel_deviations(f, settings.sigma_per_scale)[rows[:, i]] for i, f in enumerate((before, after)))
+    sigma0 = pixel_deviations(before, settings.sigma_per_scale)[rows[:, 0]]
+    sigma1 = pixel_deviations(after, settings.sigma_per_scale)[rows[:, 1]]
     try:
         estimate = estimate_motion(rig, uv0, uv1, sigma0, sigma1, settings, rng)
     except ConsensusError:
         raise ConsensusError(
-            f"{names[0]} to {names[1]}: too few of {len(rows)} matches through all four images agree on a motion; do "
+            f"{pair}: too few of {len(rows)} matches through all four images agree on a motion; do "
             "the pairs show the same scene, one soon after the other, and is the left image the left one?"
         ) from None
     except InputError as error:
-        raise type(error)(f"{names[0]} to {names[1]}: {error}") from None
+        raise type(error)(f"{pair}: {error}") from None
     if settings.estimator == "reprojection" and estimate.chi2 > MISFIT * estimate.dof:
         raise ConsensusError(
-            f"{names[0]} to {names[1]}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
+            f"{pair}: chi2/dof of the inliers is {estimate.chi2 / estimate.dof:.1f} where 1 is "
             "right; are the cameras swapped or badly calibrated, or is sigma_per_scale too small?"
         )
     return RelativeMotion(**vars(estimate), uv0=uv0, uv1=uv1, sigma0=sigma0, sigma1=sigma1, rows=rows)
@@ -234,35 +242,65 @@ def estimate_motion(
         As :func:`relative_motion`.
     """
     pose, inliers = resect_ransac(rig, uv0, uv1, sigma0, sigma1, gate=settings.gate, rng=rng)
-    S0, S1 = diagonal_covariances(sigma0), diagonal_covariances(sigma1)
+    S0 = diagonal_covariances(sigma0)
+    S1 = diagonal_covariances(sigma1)
     if settings.estimator != "reprojection":
-        before, after = triangulate(rig, uv0[inliers]), triangulate(rig, uv1[inliers])
-        C_before = triangulation_covariance(rig, uv0[inliers], S0[inliers])
-        C_after = triangulation_covariance(rig, uv1[inliers], S1[inliers])
-        pose = (register_horn if settings.estimator == "horn" else register_svd)(before, after)
-        S = registration_covariance(before, after, C_before, C_after, pose)
-        chi2 = float(squared_distances(before, after, pose.R, pose.t, C_before, C_after).sum())
-        far = np.sqrt(C_before[:, 2, 2]) > FIRST_ORDER * before[:, 2]
-        variance = np.trace(C_before, axis1=1, axis2=2)
-        far_share = float(variance[far].sum() / variance.sum())
-        return MotionEstimate(pose, S, inliers, chi2, 3 * len(before) - 6, far_share=far_share)
+        return _registered(rig, uv0[inliers], uv1[inliers], S0[inliers], S1[inliers], settings.estimator, inliers)
     for _ in range(REFITS):
         refined, used = _refined(rig, uv0, uv1, S0, S1, pose, inliers)
         pose = refined.pose
-        inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, pose), settings.gate, used)
+        squared = squared_reprojections(rig, uv0, uv1, sigma0, sigma1, pose)
+        inliers = inliers_within(squared, settings.gate, used)
         if (inliers == used).all():
             break
     return MotionEstimate(pose, refined.covariance, used, refined.chi2, refined.dof)
 
 
+def _registered(
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    S0: Array,
+    S1: Array,
+    estimator: str,
+    inliers: Array,
+) -> MotionEstimate:
+    """The registration of the triangulated inliers, and what far points bring of their variance."""
+    before = triangulate(rig, uv0)
+    after = triangulate(rig, uv1)
+    C_before = triangulation_covariance(rig, uv0, S0)
+    C_after = triangulation_covariance(rig, uv1, S1)
+    register = register_svd
+    if estimator == "horn":
+        register = register_horn
+    pose = register(before, after)
+    far = np.sqrt(C_before[:, 2, 2]) > FIRST_ORDER * before[:, 2]
+    variance = np.trace(C_before, axis1=1, axis2=2)
+    return MotionEstimate(
+        pose,
+        covariance=registration_covariance(before, after, C_before, C_after, pose),
+        inliers=inliers,
+        chi2=float(squared_distances(before, after, pose.R, pose.t, C_before, C_after).sum()),
+        dof=3 * len(before) - 6,
+        far_share=float(variance[far].sum() / variance.sum()),
+    )
+
+
 def _refined(
-    rig: StereoRig, uv0: Array, uv1: Array, S0: Array, S1: Array, pose: RelativePose, inliers: Array
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    S0: Array,
+    S1: Array,
+    pose: RelativePose,
+    inliers: Array,
 ) -> tuple[Refined, Array]:
     """The refined pose of the inliers (N,) bool, and those that were used: all whose points the images fix."""
     used = inliers.copy()
     while True:
         try:
-            return refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy"), used
+            refined = refine_reprojection(rig, uv0[used], uv1[used], pose, S0[used], S1[used], robust="cauchy")
+            return refined, used
         except MatchError as error:
             if error.match is None or used.sum() <= FEWEST:
                 raise
@@ -279,7 +317,7 @@ def pixel_deviations(features: StereoFeatures, sigma_per_scale: float) -> Array:
     """Standard deviations (M, 4) of :func:`pixels`, px: the SIFT scale, sec. 2.3.1, times a calibrated factor."""
     left, right = features.pairs.T
     scale = np.column_stack([features.left.scale[left], features.right.scale[right]])
-    return np.asarray(sigma_per_scale * scale.repeat(2, axis=1))
+    return sigma_per_scale * scale.repeat(2, axis=1)
 
 
 def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
@@ -288,9 +326,10 @@ def usable(rig: StereoRig, uv: Array, min_disparity: float) -> Array:
     The disparity itself counts as well: off the epipolar line least squares makes a near point of a small disparity.
     """
     good = triangulable(rig, uv)
-    good[good] = triangulate(rig, uv[good])[:, 2] <= rig.K_left[0, 0] * rig.baseline / min_disparity
+    furthest = rig.f * rig.baseline / min_disparity
+    good[good] = triangulate(rig, uv[good])[:, 2] <= furthest
     good[good] = disparities(rig, uv[good]) >= min_disparity * (1.0 - ROUNDING)
-    return np.asarray(good)
+    return good
 
 
 def disparities(rig: StereoRig, uv: Array) -> Array:
@@ -302,11 +341,6 @@ def disparities(rig: StereoRig, uv: Array) -> Array:
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
     turn = np.stack([x, y, np.cross(x, y)])
-    left = homogeneous(uv[:, :2]) @ np.linalg.inv(rig.K_left).T @ turn.T
-    right = homogeneous(uv[:, 2:]) @ np.linalg.inv(rig.K_right).T @ rig.R.T @ turn.T
-    return np.asarray(rig.K_left[0, 0] * (left[:, 0] / left[:, 2] - right[:, 0] / right[:, 2]))
-
-
-def diagonal_covariances(sigma: Array) -> Array:
-    """Covariances (N, k, k) of independent components with standard deviations (N, k)."""
-    return np.asarray(sigma[:, :, None] ** 2 * np.eye(sigma.shape[1]))
+    x_left, _, z_left = turn @ np.linalg.inv(rig.K_left) @ homogeneous(uv[:, :2]).T
+    x_right, _, z_right = turn @ rig.R @ np.linalg.inv(rig.K_right) @ homogeneous(uv[:, 2:]).T
+    return rig.f * (x_left / z_left - x_right / z_right)

@@ -12,16 +12,14 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import propagated
+from consistency.referee.geometry.lie_groups import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras import arrays
 from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockError
 
 LOCKED = 1e-6  # cosine of the pitch below which six digits of roll and yaw are left
 
-AXES = np.array(
-    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
-)  # [e_k]x, the rotations' generators
+AXES = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2)  # [e_k]x, the rotations' generators
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +59,11 @@ class RelativePose:
     @property
     def matrix(self) -> Array:
         """Homogeneous matrix [R t; 0 1] of the motion, (4, 4)."""
-        return np.block([[self.R, self.t[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+        return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])
 
     def apply(self, points: Array) -> Array:
         """R p + t of points (N, 3)."""
-        return np.asarray(points @ self.R.T + self.t)
+        return points @ self.R.T + self.t
 
     def compose(self, other: RelativePose) -> RelativePose:
         """p1 = self(other(p3)): first ``other``, then this motion."""
@@ -81,8 +79,10 @@ def euler_angles(R: Array) -> Array:
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
     if (cosine < LOCKED).any():
         raise GimbalLockError("pose: a pitch of 90 degrees, roll and yaw are not defined; turn the frames' axes")
-    roll, yaw = np.arctan2(R[..., 2, 1], R[..., 2, 2]), np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    pitch = np.arctan2(-R[..., 2, 0], cosine)
+    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
@@ -91,22 +91,39 @@ def rotation_derivatives(pose: RelativePose) -> tuple[Array, Array]:
     Each angle turns about one axis e: the derivative is [e]x on the side of R where that axis does not turn, which is
     the frame 2 for roll, and frame 1 for yaw and, with e = Rz(yaw) e_y, for pitch.
     """
-    R, (X, _, Z), yaw = pose.R, AXES, pose.rpy[2]
+    R = pose.R
+    X, _, Z = AXES
+    yaw = pose.rpy[2]
     Y = cross_matrix(np.array([-np.sin(yaw), np.cos(yaw), 0.0]))
-    R_r, R_p, R_y = R @ X, Y @ R, Z @ R
-    R_rp, R_ry, R_py = Y @ R_r, Z @ R_r, Z @ R_p
-    second = [[R_r @ X, R_rp, R_ry], [R_rp, Y @ R_p, R_py], [R_ry, R_py, Z @ R_y]]
+    R_r = R @ X
+    R_p = Y @ R
+    R_y = Z @ R
+    R_rp = Y @ R_r
+    R_ry = Z @ R_r
+    R_py = Z @ R_p
+    second = [
+        [R_r @ X, R_rp, R_ry],
+        [R_rp, Y @ R_p, R_py],
+        [R_ry, R_py, Z @ R_y],
+    ]
     return np.array([R_r, R_p, R_y]), np.array(second)
 
 
 def angular(pose: RelativePose) -> Array:
     """E (3, 3) with omega = E d rpy: the small rotation of frame 1 that a change of the angles is."""
     _, pitch, yaw = pose.rpy
-    cp, sp, cy, sy = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    return np.array([[cy * cp, -sy, 0.0], [sy * cp, cy, 0.0], [-sp, 0.0, 1.0]])
+    E = np.eye(3)
+    E[:, 0] = geometry.rotation(0.0, pitch, yaw)[:, 0]
+    E[:, 1] = geometry.rotation(0.0, 0.0, yaw)[:, 1]
+    return E
 
 
-def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[RelativePose, Array]:
+def compose(
+    a: RelativePose,
+    S_a: Array,
+    b: RelativePose,
+    S_b: Array,
+) -> tuple[RelativePose, Array]:
     """a after b, with covariance to first order; the errors of the two are independent.
 
     Parameters
@@ -120,16 +137,19 @@ def compose(a: RelativePose, S_a: Array, b: RelativePose, S_b: Array) -> tuple[R
     GimbalLockError
         One of the three poses has a pitch of +-90 degrees.
     """
-    S_a, S_b = (arrays.covariances(name, S, 1, 6)[0] for name, S in (("S_a", S_a), ("S_b", S_b)))
+    S_a = arrays.covariances("S_a", S_a, 1, 6)[0]
+    S_b = arrays.covariances("S_b", S_b, 1, 6)[0]
     both = a.compose(b)
-    E_a, E_b, E_inverse = angular(a), angular(b), np.linalg.inv(angular(both))
-    J_a, J_b = np.eye(6), np.zeros((6, 6))
+    E_a = angular(a)
+    E_b = angular(b)
+    E_inverse = np.linalg.inv(angular(both))
+    J_a = np.eye(6)
+    J_b = np.zeros((6, 6))
     J_a[:3, 3:] = -cross_matrix(a.R @ b.t) @ E_a
     J_a[3:, 3:] = E_inverse @ E_a
     J_b[:3, :3] = a.R
     J_b[3:, 3:] = E_inverse @ a.R @ E_b
-    S = J_a @ S_a @ J_a.T + J_b @ S_b @ J_b.T
-    return both, np.asarray(0.5 * (S + S.T))
+    return both, propagated(J_a, S_a) + propagated(J_b, S_b)
 
 
 def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
@@ -139,10 +159,10 @@ def invert(pose: RelativePose, S: Array) -> tuple[RelativePose, Array]:
     J = np.zeros((6, 6))
     J[:3, :3] = -pose.R.T
     J[:3, 3:] = -pose.R.T @ cross_matrix(pose.t) @ angular(pose)
-    J[3:, 3:] = -np.linalg.inv(angular(inverse)) @ pose.R.T @ angular(pose)
+    J[3:, 3:] = -np.linalg.solve(angular(inverse), pose.R.T @ angular(pose))
     return inverse, propagated(J, S)
 
 
 def cross_matrix(v: Array) -> Array:
-    """[v]x (3, 3), with [v]x w = v x w."""
-    return np.asarray(np.tensordot(v, AXES, 1))
+    """[v]x (..., 3, 3) of vectors (..., 3), with [v]x w = v x w."""
+    return np.tensordot(v, AXES, 1)

@@ -13,14 +13,14 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
 from consistency.stereo.visual_odometry.covariance_propagation import triangulation_covariance
-from consistency.stereo.visual_odometry.registration import draws_for, fewest
+from consistency.stereo.visual_odometry.registration import draw_triples, draws_for, fewest
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches
 
 ROUND = 32  # draws at once
 MOST = 1024  # draws at most; finds CONFIDENCE from a share of inliers of 19 % on
 SLACK_PX = 1.0  # of a coordinate in the search: poses of three noisy points miss all others by some pixels
-MEDIAN = float(stats.chi2.median(4))  # of an honest squared distance
+MEDIAN = stats.chi2.median(4)  # of an honest squared distance
 ROUNDS = 10  # of the gate to the noise that is there, at most
 FEWEST = 8  # inliers that tell how large the noise is
 
@@ -59,7 +59,8 @@ def resect_ransac(
         No motion has enough inliers: 4, and a tenth of the matches.
     """
     least = fewest(len(uv0))
-    found, inliers = _search(rig, triangulate(rig, uv0), uv1, sigma0**2 + sigma1**2 + SLACK_PX**2, gate, rng)
+    variance = sigma0**2 + sigma1**2 + SLACK_PX**2
+    found, inliers = _search(rig, triangulate(rig, uv0), uv1, variance, gate, rng)
     if found is not None:
         inliers = inliers_within(squared_reprojections(rig, uv0, uv1, sigma0, sigma1, found), gate, inliers)
     if found is None or inliers.sum() < least:
@@ -71,7 +72,12 @@ def resect_ransac(
 
 
 def squared_reprojections(
-    rig: StereoRig, uv0: Array, uv1: Array, sigma0: Array, sigma1: Array, pose: RelativePose
+    rig: StereoRig,
+    uv0: Array,
+    uv1: Array,
+    sigma0: Array,
+    sigma1: Array,
+    pose: RelativePose,
 ) -> Array:
     """Squared Mahalanobis distances (N,) in frame 1 of the points triangulated in frame 0, 4 degrees of freedom.
 
@@ -79,13 +85,20 @@ def squared_reprojections(
     """
     camera = PixelMatches(rig)
     seen = (triangulate(rig, uv0) - pose.t) @ pose.R
-    residual, J = uv1 - camera.value(seen), camera.jacobian(seen) @ pose.R.T
-    C0 = triangulation_covariance(rig, uv0, sigma0[:, :, None] ** 2 * np.eye(4))
-    S = J @ C0 @ np.swapaxes(J, 1, 2) + sigma1[:, :, None] ** 2 * np.eye(4)
-    squared, there = np.full(len(uv0), np.inf), np.isfinite(S).all(axis=(1, 2))
-    solved = np.linalg.solve(S[there], residual[there][:, :, None])[:, :, 0]
-    squared[there] = (residual[there] * solved).sum(axis=1)
+    residual = uv1 - camera.value(seen)
+    J = camera.jacobian(seen) @ pose.R.T
+    C0 = triangulation_covariance(rig, uv0, diagonal_covariances(sigma0))
+    S = J @ C0 @ np.swapaxes(J, 1, 2) + diagonal_covariances(sigma1)
+    in_front = np.isfinite(S).all(axis=(1, 2))
+    scaled = np.linalg.solve(S[in_front], residual[in_front][:, :, None])[:, :, 0]
+    squared = np.full(len(uv0), np.inf)
+    squared[in_front] = (residual[in_front] * scaled).sum(axis=1)
     return squared
+
+
+def diagonal_covariances(sigma: Array) -> Array:
+    """Covariances (N, k, k) of independent components with standard deviations (N, k)."""
+    return sigma[:, :, None] ** 2 * np.eye(sigma.shape[1])
 
 
 def inliers_within(squared: Array, gate: float, among: Array) -> Array:
@@ -100,8 +113,10 @@ def inliers_within(squared: Array, gate: float, among: Array) -> Array:
     """
     inliers = among
     for _ in range(ROUNDS):
-        scale = max(1.0, float(np.median(squared[inliers])) / MEDIAN) if inliers.sum() >= FEWEST else 1.0
-        found = np.asarray(squared <= scale * gate**2)
+        scale = 1.0
+        if inliers.sum() >= FEWEST:
+            scale = max(1.0, np.median(squared[inliers]) / MEDIAN)
+        found = squared <= scale * gate**2
         if (found == inliers).all():
             break
         inliers = found
@@ -109,12 +124,21 @@ def inliers_within(squared: Array, gate: float, among: Array) -> Array:
 
 
 def _search(
-    rig: StereoRig, p0: Array, uv1: Array, variance: Array, gate: float, rng: np.random.Generator
+    rig: StereoRig,
+    p0: Array,
+    uv1: Array,
+    variance: Array,
+    gate: float,
+    rng: np.random.Generator,
 ) -> tuple[RelativePose | None, Array]:
     """The pose of the least cost of adaptively many draws, None where no triple gave one, and its inliers (N,)."""
-    least, best, inliers, draws, needed = np.inf, None, np.zeros(len(p0), bool), 0, float(MOST)
+    least = np.inf
+    best = None
+    inliers = np.zeros(len(p0), bool)
+    draws = 0
+    needed: float = MOST
     while draws < needed:
-        R, t = _poses_of(rig, p0, uv1, rng.random((ROUND, len(p0))).argpartition(2, axis=1)[:, :3])
+        R, t = _poses_of(rig, p0, uv1, draw_triples(rng, ROUND, len(p0)))
         draws += ROUND
         if not len(R):
             continue
@@ -124,15 +148,23 @@ def _search(
         cost = np.minimum(squared, gate**2).sum(axis=1)
         k = int(np.argmin(cost))
         if cost[k] < least:
-            least, best, inliers = cost[k], RelativePose(R[k], t[k]), squared[k] <= gate**2
-            needed = draws_for(float(inliers.mean()), MOST)
+            least = cost[k]
+            best = RelativePose(R[k], t[k])
+            inliers = squared[k] <= gate**2
+            needed = draws_for(inliers.mean(), MOST)
     return best, inliers
 
 
-def _poses_of(rig: StereoRig, p0: Array, uv1: Array, triples: Array) -> tuple[Array, Array]:
+def _poses_of(
+    rig: StereoRig,
+    p0: Array,
+    uv1: Array,
+    triples: Array,
+) -> tuple[Array, Array]:
     """R (k, 3, 3) and t (k, 3) of p0 = R p1 + t, up to four for each triple (n, 3)."""
     cv2 = opencv()
-    R, t = [], []
+    R = []
+    t = []
     for triple in triples:
         _, turns, shifts = cv2.solveP3P(
             p0[triple], np.ascontiguousarray(uv1[triple, :2]), rig.K_left, None, flags=cv2.SOLVEPNP_AP3P

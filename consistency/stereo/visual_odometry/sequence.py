@@ -15,8 +15,9 @@ from consistency.referee.parsing import HUGE, is_file, read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, rectify
+from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, in_px, rectify
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
@@ -28,7 +29,7 @@ FEWEST = 2  # stereo pairs
 
 
 @dataclass(frozen=True)
-class Sequence:
+class StereoSequence:
     """Stereo pairs in the order of time; images are read when they are asked for."""
 
     folder: Path
@@ -43,6 +44,14 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.left)
 
+    @property
+    def uvd_rig(self) -> StereoRig:
+        """The rig of the rectified images, side by side as the cameras of a sensor ``uvd``; else InputError."""
+        rig = self.rectification.rig
+        if not is_rectified(rig):
+            raise InputError(f"{self.calibration.source}: the cameras do not stand side by side; no uvd sensor does")
+        return rig
+
     def pair(self, frame: int) -> tuple[Array, Array]:
         """Rectified grey images (h, w) of a frame.
 
@@ -52,7 +61,8 @@ class Sequence:
             An image cannot be read or has another size than the first one.
         """
         size = self.rectification.rig.image_size
-        left, right = (read_image(path, size) for path in (self.left[frame], self.right[frame]))
+        left = read_image(self.left[frame], size)
+        right = read_image(self.right[frame], size)
         return self.rectification.apply(left, right)
 
     def __iter__(self) -> Iterator[tuple[Array, Array]]:
@@ -66,7 +76,7 @@ def read_sequence(
     left: str | None = None,
     right: str | None = None,
     rate: float | None = None,
-) -> Sequence:
+) -> StereoSequence:
     """The stereo pairs of a folder and their calibration.
 
     Parameters
@@ -95,9 +105,17 @@ def read_sequence(
         raise InputError(f"--rate {rate}: must be a positive number of Hz")
     if (left is None) != (right is None):
         raise InputError("--left and --right go together: patterns of the left and of the right images")
-    kind = format or ("opencv" if left is not None else _recognised(folder))
+    kind = format
+    if kind is None:
+        kind = "opencv"
+        if left is None:
+            kind = _recognised(folder)
+    home = None
+    t = None
     if kind == "kitti":
-        files, t, home = _kitti(folder), _kitti_times(folder), folder / "calib.txt"
+        files = _kitti(folder)
+        t = _kitti_times(folder)
+        home = folder / "calib.txt"
     elif kind == "kitti-raw":
         files, t = _kitti_raw(folder)
         home = place_of(folder, RAW_CALIBRATION) or folder.absolute().parent / RAW_CALIBRATION
@@ -105,19 +123,23 @@ def read_sequence(
         files, t = _euroc(folder)
         home = folder
     else:
-        files, t, home = _plain(folder, left, right), None, None
-    if calibration is None and home is None:
+        files = _plain(folder, left, right)
+    home = calibration or home
+    if home is None:
         raise InputError(f"{folder}: plain images need --calibration FILE, an OpenCV YAML or a KITTI calib.txt")
     _require_pairs(folder, files, t)
+    timed = t is not None
     if t is None:
         _require_no_gap(files[0])
+        t = np.arange(len(files[0])) / (rate or RATE)
     size = read_image(files[0][0]).shape[::-1]
-    names = [side[0].parent.parent.name if kind == "kitti-raw" else side[0].parent.name for side in files]
-    cameras = read_calibration(calibration or home or folder, names[0], names[1], size)
+    folders = [side[0].parent for side in files]
+    if kind == "kitti-raw":  # whose images are one deeper, in ``data``
+        folders = [folder.parent for folder in folders]
+    cameras = read_calibration(home, folders[0].name, folders[1].name, size)
     with reading(cameras.source, "its cameras cannot be rectified"):
         rectification = rectify(cameras, size)
-    times = np.arange(len(files[0])) / (rate or RATE) if t is None else t
-    return Sequence(folder, kind, *files, times, t is not None, cameras, rectification)
+    return StereoSequence(folder, kind, *files, t, timed, cameras, rectification)
 
 
 def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
@@ -128,7 +150,8 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
     InputError
         There is no such file, it is not an image, or it has another size.
     """
-    cv2, path = opencv(), Path(path)
+    cv2 = opencv()
+    path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such image")
     try:
@@ -138,9 +161,9 @@ def read_image(path: str | Path, size: tuple[int, int] | None = None) -> Array:
     if image is None:
         raise InputError(f"{path}: cannot be read as an image; damaged or of an unknown format")
     if size is not None and image.shape[::-1] != tuple(size):
-        expected_size, size_there = (f"{width} x {height} px" for width, height in (size, image.shape[::-1]))
-        raise InputError(f"{path}: has {size_there}, other images {expected_size}; all must have one size")
-    return np.asarray(image)
+        there = in_px(image.shape[::-1])
+        raise InputError(f"{path}: has {there}, other images {in_px(size)}; all must have one size")
+    return image
 
 
 def _recognised(folder: Path) -> str:
@@ -155,7 +178,10 @@ def _recognised(folder: Path) -> str:
 
 def _pair_of(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str] | None:
     """The first two cameras that have folders of their own."""
-    return next((pair for pair in pairs if all((folder / camera).is_dir() for camera in pair)), None)
+    for one, two in pairs:
+        if (folder / one).is_dir() and (folder / two).is_dir():
+            return one, two
+    return None
 
 
 def _required_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[str, str]:
@@ -165,33 +191,46 @@ def _required_pair(folder: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[st
 
 
 def _images(folder: Path, pattern: str = "*") -> list[Path]:
-    return sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    found = []
+    for path in folder.glob(pattern):
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+            found.append(path)
+    return sorted(found)
 
 
 def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array | None) -> None:
     pairs = min(map(len, files))
     if pairs < FEWEST:
         raise InputError(f"{folder}: holds {pairs} stereo pairs; a motion takes at least {FEWEST}")
-    if t is not None and len(t) != pairs:
+    if t is None:
+        return
+    if len(t) != pairs:
         raise InputError(f"{folder}: {len(t)} timestamps for {pairs} stereo pairs; leave the timestamps of these pairs")
-    if t is not None and (stuck := np.diff(t) <= 0).any():
-        raise InputError(f"{folder}: timestamps are not increasing at stereo pair {int(np.argmax(stuck)) + 2}")
+    stuck = np.flatnonzero(np.diff(t) <= 0)
+    if len(stuck):
+        raise InputError(f"{folder}: timestamps are not increasing at stereo pair {stuck[0] + 2}")
 
 
 def _number(path: Path) -> int | None:
     """The last number in a file's name, or None."""
     digits = re.findall(r"\d+", path.stem)
-    return int(digits[-1]) if digits else None
+    if not digits:
+        return None
+    return int(digits[-1])
 
 
 def _require_no_gap(files: list[Path]) -> None:
     """Without timestamps the frames are taken as equally far apart: their numbers must not skip one."""
-    numbers = [_number(path) for path in files]
-    steps = np.diff([n for n in numbers if n is not None])
-    if None in numbers or len(steps) == 0 or (least := steps.min()) <= 0 or (steps % least).any():
+    numbers = list(map(_number, files))
+    if None in numbers:
         return  # names do not count frames
-    if (far := steps > least).any():
-        k = int(np.argmax(far))
+    steps = np.diff(np.array(numbers))
+    least = steps.min()
+    if least <= 0 or (steps % least).any():
+        return
+    far = np.flatnonzero(steps > least)
+    if len(far):
+        k = far[0]
         raise InputError(
             f"{files[k + 1]}: frames are missing between {files[k].name} and it, and no times are there; add the "
             "frames, or times.txt"
@@ -200,10 +239,9 @@ def _require_no_gap(files: list[Path]) -> None:
 
 def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Path], list[Path]]:
     """Both lists, if every image has a partner of the same name."""
-    names = [{path.stem for path in side} for side in (left, right)]
-    for side, lonely in ((left, names[0] - names[1]), (right, names[1] - names[0])):
-        if lonely:
-            path = next(path for path in side if path.stem in lonely)
+    names = {path.stem for path in left} & {path.stem for path in right}
+    for path in left + right:
+        if path.stem not in names:
             raise InputError(f"{path}: has no partner of the other camera in {folder}; add it, or leave this one out")
     return left, right
 
@@ -220,7 +258,7 @@ def _kitti_times(folder: Path) -> Array | None:
     t = read_number_table(path, None, "must hold one time in seconds a line")
     if t.shape[1] != 1:
         raise InputError(f"{path}: must hold one time in seconds a line")
-    return np.asarray(t[:, 0])
+    return t[:, 0]
 
 
 def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
@@ -236,69 +274,98 @@ def read_number_table(path: Path, delimiter: str | None, refusal: str) -> Array:
     text = read_text(path, refusal)
     with reading(path, refusal):
         lines = [line for line in text.splitlines() if line.split("#", 1)[0].strip()]
-        values = np.loadtxt(lines, delimiter=delimiter, ndmin=2) if lines else np.empty((0, 0))
+        values = np.empty((0, 0))
+        if lines:
+            values = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
         if not (np.abs(values) < HUGE).all():
             raise ValueError("a number that is not finite")
-    return np.asarray(values)
+    return values
 
 
 def _euroc(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
     """Images of both cameras and times in seconds; the names, or data.csv, are nanoseconds."""
-    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    left, right = (_camera(root / camera) for camera in ("cam0", "cam1"))
-    both = _by_name(root, list(left.values()), list(right.values()))
-    stamps = np.array(sorted(left), dtype=np.int64)
-    return both, stamps / 1e9
+    root = folder
+    if (folder / "mav0").is_dir():
+        root = folder / "mav0"
+    left = _camera(root / "cam0")
+    right = _camera(root / "cam1")
+    files = _by_name(root, list(left.values()), list(right.values()))
+    return files, np.array(list(left)) / 1e9
 
 
 def _camera(folder: Path) -> dict[int, Path]:
     """Images of one camera by their time in nanoseconds, sorted."""
-    images = folder / "data" if (folder / "data").is_dir() else folder
+    images = folder
+    if (folder / "data").is_dir():
+        images = folder / "data"
     if not images.is_dir():
         raise InputError(f"{folder}: no such folder of images")
     table = folder / "data.csv"
     with reading(folder, "times must be whole nanoseconds, each once, in data.csv or as the images' names"):
         if table.is_file():
-            lines = read_text(table, "cannot be read").splitlines()
-            rows = [row for row in csv.reader(lines) if row and not row[0].startswith("#")]
-            if any(len(row) < 2 for row in rows):
-                raise ValueError("a line without the name of an image")
-            pairs = [(int(row[0]), images / row[1].strip()) for row in rows]
+            pairs = _listed_images(table, images)
         else:
             pairs = [(int(path.stem), path) for path in _images(images)]
-        by_time = dict(pairs)
-        if len(by_time) < len(pairs) or not all(0 <= time < 2**63 for time in by_time):
+        by_time = dict(sorted(pairs))
+        impossible = [time for time in by_time if not 0 <= time < 2**63]
+        if len(by_time) < len(pairs) or impossible:
             raise ValueError("a time is duplicated, or is none")
     for path in by_time.values():
         if not is_file(path):
             raise InputError(f"{table}: names {path.name}, which is not in {images}")
-    return dict(sorted(by_time.items()))
+    return by_time
+
+
+def _listed_images(table: Path, images: Path) -> list[tuple[int, Path]]:
+    """Times and images that a ``data.csv`` names."""
+    pairs = []
+    for row in csv.reader(read_text(table, "cannot be read").splitlines()):
+        if not row or row[0].startswith("#"):
+            continue
+        if len(row) < 2:
+            raise ValueError("a line without the name of an image")
+        pairs.append((int(row[0]), images / row[1].strip()))
+    return pairs
 
 
 def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
     """Images by pattern, paired in sorted order; names may differ between the cameras."""
     given = left is not None and right is not None
     if left is None or right is None:
-        folders = (folder / "left").is_dir() and (folder / "right").is_dir()
-        left, right = ("left/*", "right/*") if folders else ("[lL]eft*", "[rR]ight*")
+        left = "[lL]eft*"
+        right = "[rR]ight*"
+        if (folder / "left").is_dir() and (folder / "right").is_dir():
+            left = "left/*"
+            right = "right/*"
     try:
-        sides = _images(folder, left), _images(folder, right)
+        lefts = _images(folder, left)
+        rights = _images(folder, right)
     except (NotImplementedError, ValueError) as error:  # of pathlib
         raise InputError(f"--left {left}, --right {right}: must be patterns below {folder} ({error})") from None
-    if not any(sides) and given:
+    none = not lefts and not rights
+    if none and given:
         raise InputError(f"{folder}: no image is like '{left}' (--left) or '{right}' (--right)")
-    if not any(sides):
+    if none:
         raise InputError(
-            f"{folder}: holds no stereo images of a known layout: {' or '.join(' and '.join(p) for p in KITTI_PAIRS)} "
+            f"{folder}: holds no stereo images of a known layout: {' or '.join(map(' and '.join, KITTI_PAIRS))} "
             "(KITTI), mav0 or cam0 and cam1 (EuRoC), left and right (plain); give the folder that holds these, or "
             "--left and --right"
         )
-    if len(sides[0]) != len(sides[1]):
+    if len(lefts) != len(rights):
         raise InputError(
-            f"{folder}: {len(sides[0])} images are like '{left}' but {len(sides[1])} like '{right}' (--left, --right)"
+            f"{folder}: {len(lefts)} images are like '{left}' but {len(rights)} like '{right}' (--left, --right)"
         )
-    numbers = [[_number(path) for path in side] for side in sides]
-    if not given and numbers[0] != numbers[1] and set(numbers[0]) & set(numbers[1]):
-        k = next(k for k, (a, b) in enumerate(zip(*numbers, strict=True)) if a != b)
-        raise InputError(f"{sides[0][k]} and {sides[1][k].name} would be a pair, but their numbers differ")
-    return sides
+    if not given:
+        _require_same_numbers(lefts, rights)
+    return lefts, rights
+
+
+def _require_same_numbers(lefts: list[Path], rights: list[Path]) -> None:
+    """Where both cameras count in the same numbers, the two images of a pair have the same one."""
+    left_numbers = list(map(_number, lefts))
+    right_numbers = list(map(_number, rights))
+    if not set(left_numbers) & set(right_numbers):
+        return
+    for k, (left, right) in enumerate(zip(left_numbers, right_numbers, strict=True)):
+        if left != right:
+            raise InputError(f"{lefts[k]} and {rights[k].name} would be a pair, but their numbers differ")

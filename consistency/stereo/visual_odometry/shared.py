@@ -19,8 +19,9 @@ from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
 from consistency.stereo.visual_odometry.odometry import neighbours
-from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, cross_matrix
+from consistency.stereo.visual_odometry.resection import diagonal_covariances
 
 # What is shared, and the standard deviation of its prior
 SHARED = {
@@ -56,21 +57,26 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     InputError
         Every motion is a bridge, or the refinement with another rig fails.
     """
-    dt = np.diff(t)
-    speed = np.array([_twist(m.pose) for m in motions]) / dt[:, None]
-    rate = np.gradient(speed, 0.5 * (t[1:] + t[:-1]), axis=0) if len(motions) > 1 else np.zeros_like(speed)
-    J, measured = np.empty((len(motions), 6, len(SHARED))), np.array([not motion.fault for motion in motions], bool)
+    measured = np.array([not motion.fault for motion in motions], bool)
     if not measured.any():
         raise InputError("motions: all are bridges, and have no matches that could tell")
-    for k in np.flatnonzero(measured).tolist():
-        J[k, :, :RIG] = _by_rig(rig, motions[k])
-    for k in np.flatnonzero(~measured).tolist():
-        around, share = neighbours(measured, t, k)
-        J[k, :, :RIG] = np.tensordot(dt[k] * share / dt[around], J[around, :, :RIG], axes=1)
+    dt = np.diff(t)
+    speed = np.array([_twist(motion.pose) for motion in motions]) / dt[:, None]
+    rate = np.zeros_like(speed)
+    if len(motions) > 1:
+        middle = 0.5 * (t[1:] + t[:-1])
+        rate = np.gradient(speed, middle, axis=0)
+    J = np.empty((len(motions), 6, len(SHARED)))
     for k, motion in enumerate(motions):
         J[k, :3, RIG:-1] = cross_matrix(motion.pose.t)
         J[k, 3:, RIG:-1] = motion.pose.R - np.eye(3)
         J[k, :, -1] = rate[k] * dt[k]
+        if measured[k]:
+            J[k, :, :RIG] = _by_rig(rig, motion)
+    for k in np.flatnonzero(~measured).tolist():
+        around, share = neighbours(measured, t, k)
+        weights = dt[k] * share / dt[around]
+        J[k, :, :RIG] = np.tensordot(weights, J[around, :, :RIG], axes=1)
     return J
 
 
@@ -98,31 +104,36 @@ def _twist(pose: RelativePose) -> Array:
 def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:
     """Derivative (6, 7) of the refined pose, by central differences."""
     i = motion.inliers
-    S0, S1 = diagonal_covariances(motion.sigma0[i]), diagonal_covariances(motion.sigma1[i])
-    columns = []
+    S0 = diagonal_covariances(motion.sigma0[i])
+    S1 = diagonal_covariances(motion.sigma1[i])
+
+    def refined(change: Array) -> RelativePose:
+        other = perturbed(rig, change)
+        return refine_reprojection(other, motion.uv0[i], motion.uv1[i], motion.pose, S0, S1, robust="cauchy").pose
+
+    J = np.empty((6, RIG))
     for k, prior in enumerate(list(SHARED.values())[:RIG]):
-        change = np.zeros(RIG)
-        change[k] = STEP * prior
-        one, other = (
-            refine_reprojection(
-                perturbed(rig, sign * change), motion.uv0[i], motion.uv1[i], motion.pose, S0, S1, robust="cauchy"
-            ).pose
-            for sign in (1.0, -1.0)
-        )
-        turn = Rotation.from_matrix(one.R @ other.R.T).as_rotvec()
-        columns.append(np.concatenate([one.t - other.t, turn]) / (2.0 * STEP * prior))
-    return np.column_stack(columns)
+        step = STEP * prior
+        up = refined(step * np.eye(RIG)[k])
+        down = refined(-step * np.eye(RIG)[k])
+        J[:3, k] = (up.t - down.t) / (2.0 * step)
+        turn = Rotation.from_matrix(up.R @ down.R.T).as_rotvec()
+        J[3:, k] = turn / (2.0 * step)
+    return J
 
 
 def perturbed(rig: StereoRig, change: Array) -> StereoRig:
     """The rig with other parameters: ``change`` (7,) in the order and units of :data:`SHARED`."""
     f, cx, cy, baseline = change[:4]
-    scale = np.diag([1.0 + f, 1.0 + f, 1.0])
-    shift = np.array([[0.0, 0.0, cx], [0.0, 0.0, cy], [0.0, 0.0, 0.0]])
-    lenses = []
-    for K in (rig.K_left, rig.K_right):
-        lens = scale @ K
-        lens[:, 2] = K[:, 2]
-        lenses.append(lens + shift)
     turn = Rotation.from_rotvec(change[4:]).as_matrix()
-    return StereoRig(lenses[0], lenses[1], rig.R @ turn, (1.0 + baseline) * rig.t, rig.image_size)
+    K_left = _other_lens(rig.K_left, f, cx, cy)
+    K_right = _other_lens(rig.K_right, f, cx, cy)
+    return StereoRig(K_left, K_right, rig.R @ turn, (1.0 + baseline) * rig.t, rig.image_size)
+
+
+def _other_lens(K: Array, f: float, cx: float, cy: float) -> Array:
+    """K (3, 3) with a focal length that is larger by the share ``f``, and the principal point moved, px."""
+    lens = K.copy()
+    lens[:2, :2] *= 1.0 + f
+    lens[:2, 2] += cx, cy
+    return lens

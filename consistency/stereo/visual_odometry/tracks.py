@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,6 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Indices
 
 PIXELS = ["z0", "z1", "z2"]
+FREE = -1  # in place of a landmark's number
 
 
 def linked(links: Sequence[Indices]) -> list[Indices]:
@@ -39,8 +40,7 @@ def linked(links: Sequence[Indices]) -> list[Indices]:
     return tracks
 
 
-@dataclass(frozen=True)
-class TrackSelection:
+class TrackSelection(NamedTuple):
     """Which observations become those of landmarks."""
 
     slots: int  # landmarks seen at once, at most
@@ -58,51 +58,51 @@ def thinned(rows: pd.DataFrame, rule: TrackSelection) -> pd.DataFrame:
 
     Parameters
     ----------
-    rows : columns piece, step, z0, z1, z2, sorted by piece, then step; z0 from the middle of the image
+    rows : columns piece, step, z0, z1, z2, sorted by piece, then step, in which a piece skips no step; z0 from the
+        middle of the image
 
     Raises
     ------
     InputError
         Nothing is left.
     """
-    rows = rows[rows["step"] >= 1].copy()
+    rows = rows[rows["step"] >= 1].reset_index(drop=True)
     column = (rows["z0"] + rule.width / 2) * rule.bands // rule.width  # of the image, from the left
-    rows["band"] = np.clip(column, 0, rule.bands - 1).astype(np.int64)
-    rows["left"] = rows.groupby("piece").cumcount(ascending=False) + 1  # observations to come, with this one
-    row_of = {key: i for i, key in enumerate(zip(rows["piece"], rows["step"], strict=True))}
-    alive: list[tuple[int, int, int]] = []  # piece, landmark, observations left
-    picked: list[tuple[int, int]] = []  # row, landmark
-    started = 0
-    for step, step_rows in rows.groupby("step"):
-        alive = [(piece, landmark, life - 1) for piece, landmark, life in alive if life > 1]
-        used = {piece for piece, _, _ in alive}
-        candidates = step_rows[(step_rows["left"] >= rule.min_life) & ~step_rows["piece"].isin(used)]
-        crowd = np.bincount(step_rows.loc[step_rows["piece"].isin(used), "band"], minlength=rule.bands)
-        for piece, life in _next_landmarks(candidates, crowd, rule.slots - len(alive), rule):
-            if life > rule.max_age:  # half for every other: cut all in one frame, nothing would link it on
-                life = rule.max_age if started % 2 else rule.max_age // 2
-            alive.append((piece, started, life))
-            started += 1
-        picked += [(row_of[piece, step], landmark) for piece, landmark, _ in alive]
-    if not picked:
+    band = np.clip(column, 0, rule.bands - 1).to_numpy(np.int64)
+    left = rows.groupby("piece").cumcount(ascending=False).to_numpy() + 1  # observations to come, with this one
+    order = np.lexsort((rows["piece"], -rows["z2"], -np.minimum(left, rule.max_age), rows["step"]))
+    landmark = np.full(len(rows), FREE)
+    count = 0
+    starts = 1 + np.flatnonzero(np.diff(rows["step"].to_numpy()[order]))
+    for at in np.split(order, starts):
+        taken = landmark[at] != FREE
+        crowd = np.bincount(band[at[taken]], minlength=rule.bands)
+        candidates = at[~taken & (left[at] >= rule.min_life)]
+        for row in _next_rows(candidates, band, crowd, rule.slots - taken.sum()):
+            life = left[row]
+            if life > rule.max_age:
+                life = rule.max_age
+                if count % 2 == 0:  # every other is half as long: cut all in one frame, nothing would link it on
+                    life //= 2
+            landmark[row : row + life] = count
+            count += 1
+    if not count:
         raise InputError(
             f"the recording holds no track that could be used: {rule.min_life} observations in a row after step 0"
         )
-    index, landmark = np.array(picked).T
-    table: pd.DataFrame = rows.iloc[index].assign(landmark=landmark)
-    return table[["step", "landmark", *PIXELS]].reset_index(drop=True)
+    table: pd.DataFrame = rows.assign(landmark=landmark)[landmark != FREE]
+    return table.sort_values(["step", "landmark"], ignore_index=True)[["step", "landmark", *PIXELS]]
 
 
-def _next_landmarks(candidates: pd.DataFrame, crowd: Indices, free: int, rule: TrackSelection) -> list[tuple[int, int]]:
-    """(piece, life) of the next landmarks, one column of the image after the other."""
-    order = candidates.assign(life=candidates["left"].clip(upper=rule.max_age)).sort_values(
-        ["life", "z2", "piece"], ascending=[False, False, True]
-    )
-    parts = [order[order["band"] == b] for b in range(rule.bands)]
-    queues = [list(zip(q["piece"], q["left"], strict=True)) for q in parts]
-    crowd, result = crowd.copy(), list[tuple[int, int]]()
-    while len(result) < free and any(queues):
-        band = min((b for b in range(rule.bands) if queues[b]), key=lambda b: crowd[b])
-        result.append(queues[band].pop(0))
-        crowd[band] += 1
-    return result
+def _next_rows(candidates: Indices, band: Indices, crowd: Indices, free: int) -> list[int]:
+    """The first observations of the next landmarks, each from the emptiest column of the image."""
+    queues = {b: list(candidates[band[candidates] == b]) for b in range(len(crowd))}
+    chosen: list[int] = []
+    while len(chosen) < free:
+        waiting = [b for b, queue in queues.items() if queue]
+        if not waiting:
+            break
+        emptiest = min(waiting, key=crowd.__getitem__)
+        chosen.append(queues[emptiest].pop(0))
+        crowd[emptiest] += 1
+    return chosen

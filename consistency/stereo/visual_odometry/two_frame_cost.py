@@ -7,7 +7,7 @@ that each q is eliminated from the second derivatives by itself (Schur complemen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
 
 
-@dataclass(frozen=True, eq=False)
-class TwoFrames:
+class TwoFrames(NamedTuple):
     """Measurements of the same points in two frames."""
 
     measure: PointMatches | PixelMatches
@@ -26,22 +25,17 @@ class TwoFrames:
     W1: Array  # (N, k, k), inverse covariance
     W2: Array  # (N, k, k)
 
-    def residuals(self, pose: RelativePose, q: Array) -> tuple[Array, Array]:
-        """e1 and e2, (N, k) each."""
-        return self.z1 - self.measure.value(pose.apply(q)), self.z2 - self.measure.value(q)
-
     def squared(self, pose: RelativePose, q: Array) -> Array:
         """2 f of each point, (N,), infinite where a point is not in front of the cameras."""
+        e1 = self.z1 - self.measure.value(pose.apply(q))
+        e2 = self.z2 - self.measure.value(q)
         with np.errstate(invalid="ignore"):
-            s = sum(
-                np.einsum("ni,nij,nj->n", e, W, e)
-                for e, W in zip(self.residuals(pose, q), (self.W1, self.W2), strict=True)
-            )
+            s = np.einsum("ni,nij,nj->n", e1, self.W1, e1)
+            s += np.einsum("ni,nij,nj->n", e2, self.W2, e2)
         return np.where(np.isnan(s), np.inf, s)
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Of f of each point by the pose d = (x, y, z, roll, pitch, yaw), by q and by z1 and z2."""
 
     d: Array  # (N, 6)
@@ -56,41 +50,61 @@ class Derivatives:
     qz2: Array  # (N, 3, k)
 
 
-def cost_derivatives(frames: TwoFrames, pose: RelativePose, q: Array, exact: bool) -> Derivatives:
+def cost_derivatives(
+    frames: TwoFrames,
+    pose: RelativePose,
+    q: Array,
+    exact: bool,
+) -> Derivatives:
     """First and second derivatives of f in closed form at ``q`` (N, 3), the points in frame 2.
 
     Without ``exact`` they are Gauss-Newton's, which leave out second derivatives of the measurement. With a = R q + t
     and A = d a / d d = [I, R_k q], f_d = A' f_a and f_q = R' f_a + (the term of frame 2).
     """
-    R, (R_k, R_kl) = pose.R, rotation_derivatives(pose)
+    R = pose.R
+    R_k, R_kl = rotation_derivatives(pose)
     f_a, f_aa, f_az, f_z1 = _frame(frames.measure, frames.z1, frames.W1, pose.apply(q), exact)
     f_b, f_bb, f_bz, f_z2 = _frame(frames.measure, frames.z2, frames.W2, q, exact)
     At = np.zeros((len(q), 6, 3))
     At[:, :3] = np.eye(3)
-    At[:, 3:] = np.swapaxes(R_k @ q.T, 0, 2).swapaxes(1, 2)
+    At[:, 3:] = np.einsum("kij,nj->nki", R_k, q)
     AtH = At @ f_aa
-    dd, dq = AtH @ np.swapaxes(At, 1, 2), AtH @ R
+    dd = AtH @ np.swapaxes(At, 1, 2)
+    dq = AtH @ R
     if exact:
-        outer = (f_a[:, :, None] * q[:, None]).reshape(-1, 9)
-        dd[:, 3:, 3:] += (outer @ R_kl.reshape(9, 9).T).reshape(-1, 3, 3)
-        dq[:, 3:] += np.swapaxes(np.swapaxes(R_k, 1, 2) @ f_a.T, 0, 2).swapaxes(1, 2)
+        outer = f_a[:, :, None] * q[:, None]
+        dd[:, 3:, 3:] += np.tensordot(outer, R_kl, ((1, 2), (2, 3)))
+        dq[:, 3:] += np.einsum("kij,ni->nkj", R_k, f_a)
     return Derivatives(
-        d=(At @ f_a[:, :, None])[:, :, 0], q=f_a @ R + f_b, z1=f_z1, z2=f_z2,
-        dd=dd, dq=dq, qq=R.T @ f_aa @ R + f_bb, dz1=At @ f_az, qz1=R.T @ f_az, qz2=f_bz,
-    )  # fmt: skip
+        d=np.einsum("nij,nj->ni", At, f_a),
+        q=f_a @ R + f_b,
+        z1=f_z1,
+        z2=f_z2,
+        dd=dd,
+        dq=dq,
+        qq=R.T @ f_aa @ R + f_bb,
+        dz1=At @ f_az,
+        qz1=R.T @ f_az,
+        qz2=f_bz,
+    )
 
 
 def _frame(
-    measure: PointMatches | PixelMatches, z: Array, W: Array, p: Array, exact: bool
+    measure: PointMatches | PixelMatches,
+    z: Array,
+    W: Array,
+    p: Array,
+    exact: bool,
 ) -> tuple[Array, Array, Array, Array]:
     """f_p, f_pp, f_pz and f_z of e' W e / 2 in one frame."""
     J = measure.jacobian(p)
-    We = (W @ (z - measure.value(p))[:, :, None])[:, :, 0]
     JtW = np.swapaxes(J, 1, 2) @ W
+    We = np.einsum("nij,nj->ni", W, z - measure.value(p))
+    f_p = -np.einsum("nij,ni->nj", J, We)
     f_pp = JtW @ J
     if exact:
         f_pp = f_pp - measure.second(p, J, We)
-    return -(We[:, None] @ J)[:, 0], f_pp, -JtW, We
+    return f_p, f_pp, -JtW, We
 
 
 class PointMatches:
@@ -104,7 +118,12 @@ class PointMatches:
         """Identity, (N, 3, 3)."""
         return np.broadcast_to(np.eye(3), (len(p), 3, 3))
 
-    def second(self, p: Array, J: Array, w: Array) -> Array:
+    def second(
+        self,
+        p: Array,
+        J: Array,
+        w: Array,
+    ) -> Array:
         """Zero, (N, 3, 3)."""
         return np.zeros((len(p), 3, 3))
 
@@ -117,20 +136,21 @@ class PixelMatches:
 
     def __init__(self, rig: StereoRig) -> None:
         P = rig.cameras
-        self.top, self.last = P[:, :2].reshape(4, 4), P[:, 2].repeat(2, axis=0)
+        self.top = P[:, :2].reshape(4, 4)
+        self.last = P[:, 2].repeat(2, axis=0)
 
     def value(self, p: Array) -> Array:
         """u, v, u', v' of points (N, 3), (N, 4), px."""
-        return np.asarray((p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p))
+        return (p @ self.top[:, :3].T + self.top[:, 3]) / self._depth(p)
 
     def jacobian(self, p: Array) -> Array:
         """Derivative of :meth:`value` by the point, (N, 4, 3), px/m."""
-        w_p = self.last[:, :3]
-        return np.asarray((self.top[:, :3] - self.value(p)[:, :, None] * w_p) / self._depth(p)[:, :, None])
+        from_depth = self.value(p)[:, :, None] * self.last[:, :3]
+        return (self.top[:, :3] - from_depth) / self._depth(p)[:, :, None]
 
     def second(self, p: Array, J: Array, w: Array) -> Array:
         """Second derivatives of the four pixels, weighted with w (N, 4) and summed, (N, 3, 3); J is (N, 4, 3)."""
-        half = np.swapaxes(J * (w / self._depth(p))[:, :, None], 1, 2) @ self.last[:, :3]
+        half = np.einsum("nij,ni,ik->njk", J, w / self._depth(p), self.last[:, :3])
         return -(half + np.swapaxes(half, 1, 2))
 
     def _depth(self, p: Array) -> Array:

@@ -16,15 +16,14 @@ import pytest
 from misbehaving import Deadly, Still
 
 import consistency as cs
-from consistency.bench.runs import batches, remote_batch
-from consistency.bench.runs.backends.choosing import executor_for
-from consistency.bench.runs.batches import ExecutorWorkers, failed
+from consistency.bench.runs import executor_batches
+from consistency.bench.runs.backends.choose_executor import executor_for
+from consistency.bench.runs.executor_batches import BatchResult, ExecutorWorkers, do_batch, failed
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
-from consistency.bench.runs.remote_batch import BatchResult, do_batch
+from consistency.bench.runs.local_workers import LocalThreads
+from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork
 from consistency.bench.store.results import open_results
-from consistency.bench.store.trial_rows import RunOutcome
 from consistency.referee.system.provenance import this_machine
 from consistency.types import Failure
 
@@ -35,7 +34,7 @@ HERE = {"cpu": "abacus", "blas": "beads"}
 def result(runs, **changes):
     """Of trials that leave nothing but their number."""
     outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
-    return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, remote_batch.versions_here()), **changes)
+    return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, executor_batches.versions_here()), **changes)
 
 
 class Killed(Exception):
@@ -86,7 +85,7 @@ class Fake(Executor):
             return finished.get(timeout=5.0)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(batches, "_next_of", next_of)
+            patch.setattr(executor_batches, "_next_of", next_of)
             yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 
@@ -190,22 +189,22 @@ def test_what_is_not_done_is_cancelled(work):
 
 @pytest.mark.parametrize("name", ["numpy", "filter-consistency", "Python"])
 def test_other_versions_are_refused(work, name):
-    older = Fake(versions=remote_batch.versions_here() | {name: "0.1"})
+    older = Fake(versions=executor_batches.versions_here() | {name: "0.1"})
     with pytest.raises(cs.InputError, match=rf"the worker on host has {name} 0.1, here it is .*; install the same"):
         done(older, work)
 
 
 def test_all_that_the_bits_depend_on_is_compared():
-    assert set(remote_batch.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
+    assert set(executor_batches.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
 
 
 def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monkeypatch):
     def own():
-        return str(remote_batch.versions_here.__wrapped__()["filter-consistency"])
+        return str(executor_batches.versions_here.__wrapped__()["filter-consistency"])
 
-    assert Path(cs.__file__).parent == remote_batch.PACKAGE
-    assert remote_batch.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
-    monkeypatch.setattr(remote_batch, "PACKAGE", tmp_path)
+    assert Path(cs.__file__).parent == executor_batches.PACKAGE
+    assert executor_batches.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
+    monkeypatch.setattr(executor_batches, "PACKAGE", tmp_path)
     seen = [own()]
     for room in ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
         (tmp_path / room / "inner").mkdir(parents=True)
@@ -325,7 +324,7 @@ def test_the_manifest_has_the_machines_that_did_runs(xyz, tmp_path, capsys, monk
     with ThreadPoolExecutor(1) as executor:
         assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [here]
         with monkeypatch.context() as patch:
-            patch.setattr(remote_batch, "this_machine", lambda: HERE)
+            patch.setattr(executor_batches, "this_machine", lambda: HERE)
             assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [HERE]  # and not this one
             cs.run_trials(xyz, still, 3, out=out, executor=executor)
     assert open_results(out).manifest["machines"] == [HERE]

@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.results_to_records import record_of, results_source
-from consistency.bench.runs.run_scores import mean_nees_of_runs
-from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.runs.run_until_decided import run_until_decided
+from consistency.bench.runs.scores_by_run import mean_nees_of_runs
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.column_names import OWN_COVARIANCE

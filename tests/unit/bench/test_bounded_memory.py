@@ -123,7 +123,7 @@ READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
     "analyse": READ
     + "from consistency.bench.runs.analyse_results import analyse\nwork = lambda f: analyse(open_results(f))",
-    "report": "from consistency.bench.pages.build import build_report as work",
+    "report": "from consistency.bench.pages.results_report import build_report as work",
     "baseline": "from consistency.referee.verdicts.baselines import baseline\n"
     + "from consistency.bench.runs.results_to_records import results_source\n"
     + "work = lambda f: baseline(results_source(f), str(f))",

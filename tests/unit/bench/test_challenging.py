@@ -27,7 +27,9 @@ from consistency.bench.challenging.challenge import (
     is_overconfident,
     write_scenario,
 )
-from consistency.bench.challenging.search import (
+from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, score_of_run
+from consistency.bench.challenging.world_space import Choice, LogScale, Point, space_of
+from consistency.bench.challenging.worst_point_search import (
     BATCH,
     RUNGS,
     Budget,
@@ -36,8 +38,6 @@ from consistency.bench.challenging.search import (
     search,
     standard_error,
 )
-from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, score_of_run
-from consistency.bench.challenging.worlds import Choice, LogScale, Point, space_of
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.path import lap_length, planned_path

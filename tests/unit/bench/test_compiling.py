@@ -19,9 +19,9 @@ import pytest
 from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.runs import compiling
-from consistency.bench.runs.findings import experiments
-from consistency.bench.runs.montecarlo import resolve_filters
+from consistency.bench.filters.filter_declarations import resolve_filters
+from consistency.bench.runs import missing_kernels
+from consistency.bench.runs.experiment_scripts import experiments
 from consistency.bench.scenario import load_scenario
 
 Done = Callable[..., tuple[str, str]]
@@ -31,7 +31,7 @@ import multiprocessing, os, resource, signal, sys, time
 from pathlib import Path
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.runs import compiling
+from consistency.bench.runs import missing_kernels
 
 def total(values):
     result = 0.0
@@ -70,7 +70,7 @@ def case():
         os.setgid(65534)
         os.setuid(65534)
     try:
-        compiling.compile_all(((f, None, None) for f in filters), int(jobs))
+        missing_kernels.compile_all(((f, None, None) for f in filters), int(jobs))
     except KeyboardInterrupt:
         print("stopped")
     else:
@@ -188,16 +188,16 @@ def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[
     made: list[int] = []
     outlook = Outlook("", is_ready=False, is_shared=False, size=4)
     mine: Any = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
-    need = compiling.Need(mine, None, None, outlook)  # type: ignore[arg-type]
-    compiling._compile([need, need], 2)
+    need = missing_kernels.Need(mine, None, None, outlook)  # type: ignore[arg-type]
+    missing_kernels._compile([need, need], 2)
     assert made == [1, 1]
     assert capsys.readouterr().err == "compiling 2 kernels of mine, once: 10 to 60 s for each\n"
 
 
 def test_a_few_filters_are_named() -> None:
     needs: Any = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
-    assert compiling._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
-    assert compiling._label(needs[:1]) == "compiling the kernel of a"
+    assert missing_kernels._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
+    assert missing_kernels._label(needs[:1]) == "compiling the kernel of a"
 
 
 # --- the size ---------------------------------------------------------------------------------------
@@ -244,10 +244,10 @@ def test_the_largest_kernel_is_compiled_first(monkeypatch: pytest.MonkeyPatch) -
 
         def shutdown(self, **_: Any) -> None: ...
 
-    monkeypatch.setattr(compiling, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(compiling, "_pickled", lambda need: need.outlook.size)
+    monkeypatch.setattr(missing_kernels, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(missing_kernels, "_pickled", lambda need: need.outlook.size)
     needs: Any = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
-    compiling._compile_side_by_side(needs, 2)
+    missing_kernels._compile_side_by_side(needs, 2)
     assert begun == [3, 2, 1]
 
 

@@ -17,6 +17,7 @@ import consistency as cs
 from consistency.bench.filters.compiler import jit
 from consistency.bench.filters.compiler.whole_program import remembered_types
 from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.simulation.world import World
 
@@ -138,20 +139,12 @@ def test_content_is_found_once(monkeypatch):
         assert Unknown.found == found
 
 
-def test_the_first_trial_is_simulated_once(monkeypatch):
+def test_a_study_draws_one_trial_before_its_runs(monkeypatch):
     world = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
-    trials = Simulated(world, 3)
+    work = TrialWork(Simulated(world, 3), Isolation([cs.get_filter("kf")], world.belief))
+    monkeypatch.setattr(TrialWork, "compile", lambda *_: None)
     made = counted(monkeypatch, World, "trial")
-    work = TrialWork(trials, Isolation([], world.belief))
-    work.room_for(1, 1)
-    first = trials.ahead(1)
+    LocalThreads(2).prepare(work, 1)
     assert made == [(1, 3)]
-    assert trials(1) is first
-    again = trials(1)
-    assert made == [(1, 3)] * 2
-    assert again is not first
-    np.testing.assert_array_equal(again.z, first.z)
-    trials.ahead(1)
-    trials.ahead(2)
-    trials(1)  # of those ahead the last one is kept
-    assert [run for run, _ in made] == [1, 1, 1, 2, 1]
+    LocalThreads(2).prepare(TrialWork(work.trials, Isolation([], world.belief)), 1)
+    assert made == [(1, 3)]

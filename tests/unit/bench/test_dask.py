@@ -16,13 +16,13 @@ from misbehaving import KINDS, Deadly, Still
 
 import consistency as cs
 from consistency.bench.runs.backends.dask import Client, DaskExecutor
-from consistency.bench.runs.batches import ExecutorWorkers
+from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
+from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.montecarlo import run_trials
+from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import Simulated, TrialWork
 from consistency.bench.store.results import StoredResults
-from consistency.bench.store.trial_rows import RunOutcome
 from consistency.bench.types import Trial
 from consistency.referee.system.provenance import this_machine
 

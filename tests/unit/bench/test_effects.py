@@ -10,15 +10,15 @@ import pytest
 from scenario_files import load, put
 
 import consistency as cs
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.models import point, stereo
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario.effects import EFFECTS, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.tables.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls
 from consistency.bench.simulation.world import purpose_of
-from consistency.bench.store.log import read_log
-from consistency.bench.store.trial_rows import observations_table
+from consistency.bench.store.recorded_log import read_log
+from consistency.bench.store.trial_tables import observations_table
 
 CALLS = []  # labels of effects in the order in which they were applied
 DRAWN = {}  # first numbers of each effect, by label

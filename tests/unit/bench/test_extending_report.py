@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from painted import by_title, lines, panels
 
 import consistency as cs
-from consistency.bench.pages import build, write_reports
-from consistency.bench.pages.build import build_report
+from consistency.bench.pages import results_report, write_reports
+from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections import study_sections
 
 
@@ -22,7 +22,7 @@ def example(monkeypatch):
     module = ModuleType("with_example")
     module.__dict__.update(vars(study_sections))
     exec(compile(code + order, "example.py", "exec"), module.__dict__)
-    monkeypatch.setattr(build, "SECTIONS", module.SECTIONS)
+    monkeypatch.setattr(results_report, "SECTIONS", module.SECTIONS)
     return module
 
 
@@ -34,7 +34,7 @@ def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path, example):
     expected = np.sqrt((error[..., :2] ** 2).sum(-1).mean(axis=0))
     assert_allclose(example.rmse(study.tracks[0]), expected)
 
-    document = build.compose(report)
+    document = results_report.compose(report)
     titles = [figure.title for figure in document.figures]
     assert titles.index("Error of the position") == titles.index("Pose errors, run 0") + 1
     (axes,) = panels(by_title(document)["Error of the position"])

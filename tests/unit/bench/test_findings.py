@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from consistency import InputError
-from consistency.bench.runs import findings as module
-from consistency.bench.runs.findings import Study, reproduce
+from consistency.bench.runs import experiment_scripts
+from consistency.bench.runs import reproduce_findings as module
+from consistency.bench.runs.reproduce_findings import Study, reproduce
 
 SCRIPT = '''"""A question."""
 import os
@@ -33,7 +34,7 @@ def scripts(tmp_path, monkeypatch):
     """Folder of experiments: two that share trials, two in processes of their own, of which one takes long."""
     folder = tmp_path / "experiments"
     folder.mkdir()
-    monkeypatch.setattr(module, "data_folder", lambda _: folder)
+    monkeypatch.setattr(experiment_scripts, "data_folder", lambda _: folder)
     write(folder, 1, ("one", "uno"))
     write(folder, 2, ("two",), "OWN_PROCESS = True")
     write(folder, 3, ("three",), "OWN_PROCESS = True\nLONG = True")

@@ -20,12 +20,12 @@ import pytest
 from edited import accept_changes, content
 
 import consistency as cs
-from consistency.bench.runs import gather, local_threads, trial_work
+from consistency.bench.runs import local_workers, outcomes_to_results, trial_work
+from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
 from consistency.bench.runs.trial_work import TrialWork
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
-from consistency.bench.store.trial_rows import RunOutcome, outcome_of
 from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
@@ -154,7 +154,7 @@ def test_few_outcomes_wait_for_their_turn(uvd, tmp_path, monkeypatch):
         return outcome
 
     monkeypatch.setattr(trial_work, "outcome_of", counted)
-    monkeypatch.setattr(local_threads, "AHEAD", 2)
+    monkeypatch.setattr(local_workers, "AHEAD", 2)
     cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
     assert len(most) == 60
     assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
@@ -296,7 +296,7 @@ def test_a_filter_without_any_row_is_resumed(uvd, tmp_path):
 
 def test_a_run_that_takes_long_keeps_no_other_from_the_journal(run, written, tmp_path, monkeypatch):
     trial, kept = World.trial, threading.Event()
-    add = gather.Gathered.add
+    add = outcomes_to_results.Gathered.add
 
     def last(self, run, seed):
         ahead = threading.current_thread() is threading.main_thread()  # looks what the first takes
@@ -310,7 +310,7 @@ def test_a_run_that_takes_long_keeps_no_other_from_the_journal(run, written, tmp
 
     monkeypatch.setattr(World, "trial", last)
     monkeypatch.setattr(TrialWork, "compile", lambda self, run, jobs: None)
-    monkeypatch.setattr(gather.Gathered, "add", counted)
+    monkeypatch.setattr(outcomes_to_results.Gathered, "add", counted)
     run(jobs=2, out=tmp_path / "out")
     assert content(tmp_path / "out") == content(written)
 
@@ -338,16 +338,16 @@ class Work:
 
 
 def test_what_ends_together_with_an_error_counts(monkeypatch):
-    monkeypatch.setattr(local_threads, "SimpleQueue", Together)
-    outcomes = local_threads.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
+    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
+    outcomes = local_workers.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):
         next(outcomes)
 
 
 def test_what_ends_together_leaves_room_for_as_many(monkeypatch):
-    monkeypatch.setattr(local_threads, "SimpleQueue", Together)
-    outcomes = local_threads.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
+    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
+    outcomes = local_workers.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
     assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 
@@ -373,7 +373,7 @@ def test_what_cannot_be_resumed_is_refused_before_any_work(run, written, tmp_pat
 def test_ctrl_c_waits_while_the_folder_is_written(run, tmp_path, monkeypatch):
     pressed = []
 
-    class Pressed(gather.Writer):
+    class Pressed(outcomes_to_results.Writer):
         def end_group(self):
             if not pressed:
                 pressed.append(1)
@@ -381,7 +381,7 @@ def test_ctrl_c_waits_while_the_folder_is_written(run, tmp_path, monkeypatch):
             super().end_group()
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(gather, "Writer", Pressed)
+    monkeypatch.setattr(outcomes_to_results, "Writer", Pressed)
     with pytest.raises(KeyboardInterrupt):
         run(runs=3, out=tmp_path / "out")
     signal.signal(signal.SIGINT, before)
@@ -426,7 +426,7 @@ def test_a_full_disk_keeps_what_was_there(run, written, tmp_path, monkeypatch, w
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(getattr(gather, where.split(".")[0]), where.split(".")[1], full)
+    monkeypatch.setattr(getattr(outcomes_to_results, where.split(".")[0]), where.split(".")[1], full)
     kept = "; 3 finished runs are kept, and the same command with --resume continues" if where == "Writer.add" else ""
     said = rf"--out .*out: cannot be written \(No space left on device\){kept}$"
     with pytest.raises(cs.InputError, match=said):

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scripts import experiment
 
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.referee.errors import InputError
 
 script = experiment("gtsam_log")

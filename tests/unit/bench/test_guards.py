@@ -11,15 +11,16 @@ from mismatch import WrongMatch, corrupted
 from scipy import stats
 
 import consistency as cs
+from consistency.bench.filters.filter_declarations import optimal_gain
 from consistency.bench.filters.guard.guarded import Guarded
-from consistency.bench.filters.stepping import optimal_gain, run_filter, step_through
+from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.build import build_report
+from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections.study_sections import rejections
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.scenario.effects import EFFECTS
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
 from consistency.commands.app import app

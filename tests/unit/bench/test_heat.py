@@ -7,14 +7,13 @@ import pytest
 from painted import panels, titles
 
 import consistency as cs
-from consistency.bench.pages import maps_of_worlds as heat
+from consistency.bench.pages import sweep_report as heat
 from consistency.bench.pages import write_regime_reports
-from consistency.bench.pages.maps_of_worlds import colour_of, heat_figure, ink_on
-from consistency.bench.sweeps.axes import Axis
-from consistency.bench.sweeps.cell import CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.plan import load_sweep
-from consistency.bench.sweeps.printing import regime_blocks
-from consistency.bench.sweeps.regime import Regime
+from consistency.bench.pages.sweep_report import colour_of, heat_figure, ink_on
+from consistency.bench.sweeps.regime_map import Regime, regime_blocks
+from consistency.bench.sweeps.run_cell import CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.sweep_axes import Axis
+from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.referee.show.svg import svg
 from consistency.referee.show.terminal import show
 
@@ -128,7 +127,7 @@ def test_axes_that_vary_alone_have_a_map_each(tmp_path, capsys):
 
 def test_long_values_are_told_apart():
     axis = Axis("truth.sensor.effects", tuple([{"kind": "mismatch", "rate": rate}] * 3 for rate in (0.1, 0.2)))
-    texts = [heat.said(axis, i) for i in range(2)]
+    texts = [heat.value_in_few_characters(axis, i) for i in range(2)]
     assert len(set(texts)) == 2
     assert max(map(len, texts)) <= heat.LONGEST
 

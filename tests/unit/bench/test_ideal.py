@@ -8,9 +8,9 @@ import pytest
 import consistency as cs
 from consistency.bench.filters import BOUNDS, filter_summaries, usable_names
 from consistency.bench.filters.compiled import is_realisable, problem_for, problem_of
-from consistency.bench.filters.stepping import run_filter, step_through
+from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 
 
 def test_only_the_ideal_filters_are_marked():

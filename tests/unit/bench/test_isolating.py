@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is
 from threadpoolctl import threadpool_info
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
-from consistency.bench.runs.gather import Gathered
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.isolation import filter_process
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.store.trial_rows import outcome_of
+from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.runs.run_outcome import outcome_of
+from consistency.bench.store.journal import IN_MEMORY, Journal
 from consistency.bench.types import Control, Observation
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")
@@ -225,11 +227,12 @@ def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario
         whole, cut = (
             (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
         )
-    gathered = Gathered(["bad"], {})
-    gathered.add(outcome_of(*whole))
-    with pytest.raises(KeyboardInterrupt):
-        gathered.add(replace(outcome_of(*cut), maps=Cut()))
-    results = gathered.results({"filters": ["bad"]}, None)
+    with closing(Journal(IN_MEMORY)) as journal:
+        gathered = Gathered(["bad"], {}, journal)
+        gathered.add(outcome_of(*whole))
+        with pytest.raises(KeyboardInterrupt):
+            gathered.add(replace(outcome_of(*cut), maps=Cut()))
+        results = gathered.results({"filters": ["bad"]}, None)
     assert results.estimates["run"].unique().tolist() == [DOOMED]
     assert results.truth["run"].unique().tolist() == [DOOMED]
     assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]

@@ -10,7 +10,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.store.trial_rows import outcome_of
+from consistency.bench.runs.run_outcome import outcome_of
 from consistency.diagnostics import JointNees, Record, Settings, judge
 from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test, last_nees
 from consistency.referee.diagnostics.questions.equivalence import is_tolerated

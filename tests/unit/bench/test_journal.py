@@ -17,9 +17,9 @@ import pytest
 from edited import accept_changes, change_manifest, content
 
 import consistency as cs
-from consistency.bench.runs import gather
-from consistency.bench.runs.gather import Gathered
+from consistency.bench.runs import outcomes_to_results
 from consistency.bench.runs.montecarlo import Interrupted
+from consistency.bench.runs.outcomes_to_results import Gathered
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import DATABASE, Journal, Unfinished
@@ -298,7 +298,7 @@ def test_only_what_is_missing_is_done_again(run, uvd, whole, tmp_path, monkeypat
         run(out=tmp_path / "out", resume=True)
     with Unfinished(tmp_path / "out", resume=True) as unfinished:
         assert unfinished.journal.runs == {0}, "it is still there"
-    monkeypatch.setattr(gather, "Writer", None)
+    monkeypatch.setattr(outcomes_to_results, "Writer", None)
     with pytest.raises(TypeError):
         run(out=tmp_path / "other")
     monkeypatch.undo()

@@ -5,7 +5,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.scenario.effects import Context
-from consistency.bench.scenario.effects.junction import Crossings
+from consistency.bench.scenario.effects.occlusion_junctions import Crossings
 from consistency.bench.simulation import World
 from consistency.referee.geometry import rotation
 

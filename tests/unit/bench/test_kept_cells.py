@@ -10,11 +10,11 @@ import consistency as cs
 from consistency.bench.runs.trial_work import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.sweeps import cell as cells
-from consistency.bench.sweeps import running
-from consistency.bench.sweeps.cell import cost_of
-from consistency.bench.sweeps.plan import load_sweep
-from consistency.bench.sweeps.running import run_sweep
+from consistency.bench.sweeps import run_cell as cells
+from consistency.bench.sweeps import run_sweep as sweeping
+from consistency.bench.sweeps.run_cell import cost_of
+from consistency.bench.sweeps.run_sweep import run_sweep
+from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.bench.sweeps.sweep_folder import SweepFolder
 
 GRID = """
@@ -41,7 +41,7 @@ def at(tmp_path, monkeypatch):
     (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
     (tmp_path / "grid.toml").write_text(GRID)
     monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
-    monkeypatch.setattr(running, "PAUSE", 0.01)
+    monkeypatch.setattr(sweeping, "PAUSE", 0.01)
     return tmp_path
 
 
@@ -188,7 +188,7 @@ def test_a_cell_that_another_process_works_on(at, monkeypatch, is_done):
     thread = threading.Thread(target=other)
     thread.start()
     assert held.wait(60.0)
-    monkeypatch.setattr(running, "run_cell", counted)
+    monkeypatch.setattr(sweeping, "run_cell", counted)
     run_sweep(grid(at), at / "out", jobs=1)
     thread.join()
     order = [work.cell.name for work in folder.all_work()]
@@ -208,7 +208,7 @@ def test_a_cell_that_was_done_after_the_sweep_began(at, monkeypatch):
         done.append(cell.name)
         return run_cell(sweep, cell, *rest, **how)
 
-    monkeypatch.setattr(running, "run_cell", meanwhile)
+    monkeypatch.setattr(sweeping, "run_cell", meanwhile)
     run_sweep(grid(at), at / "out", jobs=1)
     assert len(done) == 2
 

@@ -12,13 +12,14 @@ import pytest
 from edited import content
 
 import consistency as cs
-from consistency.bench.runs import gather, sequential
+from consistency.bench.runs import outcomes_to_results
+from consistency.bench.runs import run_until_decided as deciding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.runs.run_outcome import RunOutcome
+from consistency.bench.runs.run_until_decided import run_until_decided
 from consistency.bench.store.journal import Unfinished
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import StoredResults, open_results
-from consistency.bench.store.trial_rows import RunOutcome
 from consistency.diagnostics import Record
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.document.judged_filters import document
@@ -63,7 +64,7 @@ def test_what_ends_the_process_takes_no_finished_run(
     world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, run: int
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(gather.Gathered, "results", None)  # as SIGKILL: nothing is written any more
+        patch.setattr(outcomes_to_results.Gathered, "results", None)  # as SIGKILL: nothing is written any more
         stop_at(run, RuntimeError("killed"))
         with pytest.raises(RuntimeError, match="killed"):
             run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
@@ -88,7 +89,7 @@ def test_killed_while_the_tables_are_written(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(gather.Writer, "add", full)
+        patch.setattr(outcomes_to_results.Writer, "add", full)
         with pytest.raises(cs.InputError, match="20 finished runs are kept, and the same command with --resume"):
             run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
     done = stop_at(-1, RuntimeError())
@@ -153,14 +154,14 @@ def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_
         with pytest.raises(cs.InputError, match=message):
             run_until_decided(world, ["kf"], out=tmp_path / str(runs), resume=True, **one)
     runs_seen: list[int] = []
-    read = sequential.record_of
+    read = deciding.record_of
 
     def seen(tables: Any, name: str, steps: int) -> Record:
         runs_seen.append(len(tables.runs_of(name)))
         return read(tables, name, steps)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sequential, "record_of", seen)
+        patch.setattr(deciding, "record_of", seen)
         previous = open_results(tmp_path / "17")
         _, verdicts = run_until_decided(world, ["kf"], previous=previous, **OPEN)
     assert runs_seen == [12, 15, 18, 20]
@@ -184,7 +185,7 @@ def test_a_look_holds_one_filter_and_no_outcome(
 ) -> None:
     records: weakref.WeakSet[Any] = weakref.WeakSet()
     outcomes: weakref.WeakSet[Any] = weakref.WeakSet()
-    most, read, add = [0, 0], sequential.record_of, gather.Gathered.add
+    most, read, add = [0, 0], deciding.record_of, outcomes_to_results.Gathered.add
 
     class Counted(RunOutcome):
         __hash__ = object.__hash__
@@ -198,14 +199,14 @@ def test_a_look_holds_one_filter_and_no_outcome(
         most[0] = max(most[0], len(records))
         return record
 
-    def counted(self: gather.Gathered, outcome: RunOutcome) -> None:
+    def counted(self: outcomes_to_results.Gathered, outcome: RunOutcome) -> None:
         known = Counted(**vars(outcome))
         outcomes.add(known)
         most[1] = max(most[1], len(outcomes))
         add(self, known)
 
-    monkeypatch.setattr(sequential, "record_of", held)
-    monkeypatch.setattr(gather.Gathered, "add", counted)
+    monkeypatch.setattr(deciding, "record_of", held)
+    monkeypatch.setattr(outcomes_to_results.Gathered, "add", counted)
     run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], max_runs=14, jobs=1, out=tmp_path / "out")
     assert most == [1, 1]
 

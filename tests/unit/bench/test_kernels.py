@@ -18,7 +18,7 @@ import consistency.bench.filters
 from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.loop import trial_kernel
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.models.point import to_robot
 

@@ -12,7 +12,7 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.bench.models.stereo import project
-from consistency.bench.store.log import read_log, write_log
+from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.bench.types import Trial
 from consistency.referee.system.provenance import manifest_of
 

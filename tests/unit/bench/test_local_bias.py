@@ -10,7 +10,7 @@ from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario import BiasMap
 from consistency.bench.scenario.effects import Distortion, LocalBias
 from consistency.bench.simulation import World
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.scenario import scenario_text
 
 U, V = [-150.0, -40.0, 30.0, 160.0], [-100.0, 10.0, 90.0]

@@ -11,7 +11,7 @@ import tomli_w
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 
 
 @pytest.fixture(scope="module")

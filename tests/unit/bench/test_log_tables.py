@@ -5,7 +5,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.commands import main
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import read_manifest

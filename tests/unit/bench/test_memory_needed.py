@@ -3,10 +3,9 @@
 import pytest
 
 import consistency as cs
-from consistency.bench.runs import memory_needed as module
+from consistency.bench.runs import local_workers as module
 from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_threads import LocalThreads
-from consistency.bench.runs.memory_needed import memory_here, workers_that_fit
+from consistency.bench.runs.local_workers import LocalThreads, memory_here, workers_that_fit
 from consistency.bench.runs.trial_work import Recorded, TrialWork
 from consistency.referee.errors import InputError
 
@@ -37,12 +36,16 @@ def test_workers_that_have_room(linear, has, capsys):
         workers_that_fit([trial], 8)
 
 
-def test_all_runs_of_a_log_count(linear, has):
+def test_all_runs_of_a_log_count(linear, has, monkeypatch):
     wide = linear.variant("wide", truth__sensor__range=(0.0, 50.0), truth__steps=5)
     small, large = cs.simulate(linear.variant("short", truth__steps=2)), cs.simulate(wide, 1)
     work = TrialWork(Recorded({0: small, 1: large}), Isolation([cs.get_filter("kf")], linear.belief))
     has(8 * covariance_bytes(large))
-    assert work.room_for(0, 8) == 2
+    local = LocalThreads(-1)
+    local._workers = 8
+    monkeypatch.setattr(TrialWork, "compile", lambda *_: None)
+    local.prepare(work, 0)
+    assert local._workers == 2
     has(covariance_bytes(large) - 1)
     with pytest.raises(InputError, match="fewer landmarks"):
         LocalThreads().prepare(work, 0)

@@ -10,7 +10,7 @@ import pytest
 from misbehaving import Still, raises
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.store.results import joined
 from consistency.bench.types import Trial
@@ -276,3 +276,10 @@ def test_a_filter_cannot_change_what_the_next_one_is_given(xyz):
     pd.testing.assert_frame_equal(both, alone.estimates)
     assert list(results.failures["filter"]) == ["in-place"] * 2
     assert results.failures["reason"].str.contains("read-only").all()
+
+
+def test_fewer_runs_than_there_are_are_refused(linear):
+    results = cs.run_trials(linear, ["kf"], runs=3, jobs=1)
+    with pytest.raises(cs.InputError, match="runs must be at least 3: so many are there already, got 2"):
+        cs.run_trials(linear, ["kf"], runs=2, jobs=1, previous=results)
+    assert cs.run_trials(linear, ["kf"], runs=3, jobs=1, previous=results).finished_runs(["kf"]) == {0, 1, 2}

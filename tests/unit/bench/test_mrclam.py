@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.findings import sibling
+from consistency.bench.runs.experiment_scripts import sibling
 
 SCRIPTS = Path(__file__).parents[3] / "experiments"
 conversion = sibling(str(SCRIPTS / "e15_mrclam.py"), "mrclam_log")

@@ -9,8 +9,8 @@ import pytest
 from painted import lines, panels
 
 import consistency as cs
-from consistency.bench.pages.build import answer, build_report, compose
-from consistency.bench.pages.sections import overview
+from consistency.bench.pages.results_report import answer, build_report, compose
+from consistency.bench.pages.sections import several_studies
 from consistency.bench.pages.sections.report_input import STEREO
 from consistency.referee.document.blocks import Figure, Name, Status, Table
 from consistency.referee.document.wording import written
@@ -32,7 +32,7 @@ def report(uvd, tmp_path_factory):
 
 
 def opening(report):
-    _, picture, verdicts = overview.opening(report)
+    _, picture, verdicts = several_studies.opening(report)
     assert isinstance(picture, Figure)
     assert isinstance(verdicts, Table)
     return picture, verdicts
@@ -65,7 +65,7 @@ def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
         (study.name, track.name): track.verdict.scale.inflation for study in report.studies for track in study.tracks
     }
     assert drawn == {key: ratio.value for key, ratio in ratios.items()}
-    assert {place.ratio for place in overview.places(report)} == set(ratios.values())
+    assert {place.ratio for place in several_studies.places(report)} == set(ratios.values())
     low, high = axes.get_xlim()
     assert all(low < ratio.value < high for ratio in ratios.values())
 
@@ -82,24 +82,27 @@ def test_a_filter_without_a_ratio_stays_in_the_table(report):
     blind = replace(study.tracks[0], verdict=replace(study.tracks[0].verdict, scale=None))
     changed = replace(report, studies=(report.studies[0], replace(study, tracks=(blind,))))
     picture, verdicts = opening(changed)
-    assert all(round(place.y) == 0 for place in overview.places(changed))
+    assert all(round(place.y) == 0 for place in several_studies.places(changed))
     assert len(lines(panels(picture)[0], "ekf-uvd")[0].get_xdata()) == 1
     assert tuple(map(written, verdicts.groups[0][1][-1][3:])) == ("–", "–")
 
 
 def test_one_study_opens_with_its_answer_alone(report):
     single = replace(report, studies=report.studies[:1])
-    assert overview.opening(single) == ()
+    assert several_studies.opening(single) == ()
     assert compose(single).opening == ()
 
 
 def test_the_opening_stands_before_the_contents_of_the_page(report):
     document = compose(report)
-    assert document.figures[0].title == overview.TITLE
+    assert document.figures[0].title == several_studies.TITLE
     page = render(document)
     first = page.index("<section")
     assert (
-        page.index('class="answer"') < page.index(overview.TITLE) < page.index("Every verdict of this report") < first
+        page.index('class="answer"')
+        < page.index(several_studies.TITLE)
+        < page.index("Every verdict of this report")
+        < first
     )
     assert page[:first].count('class="chart') == 1
 
@@ -108,7 +111,7 @@ def test_the_opening_is_printed(report, monkeypatch):
     monkeypatch.setattr(pdf.typst, "compile", lambda path, **_: Path(path).with_name("data.json").read_bytes())
     data = json.loads(pdf.render_pdf(compose(report)))
     assert [block["kind"] for block in data["opening"]] == ["Text", "Figure", "Table"]
-    assert pdf.soft(overview.TITLE) == data["opening"][1]["title"]
+    assert pdf.soft(several_studies.TITLE) == data["opening"][1]["title"]
 
 
 @pytest.fixture
@@ -125,7 +128,7 @@ def test_the_first_page_has_question_answer_curves_and_origin(of_paper):
     assert "Herath, Kodagoda and Dissanayake (2007)" in question.text
     assert curves.title == "NEES over time at a baseline of 9 cm"
     assert origin.text == "command: consistency reproduce; date: 2026-01-02; git commit: abc."
-    assert picture.title == overview.TITLE
+    assert picture.title == several_studies.TITLE
     statuses = {track.name: track.verdict.status for track in of_paper.studies[0].tracks}
     assert made.answer.startswith("At a baseline of 9 cm, ")
     assert all(name in made.answer and status in made.answer for name, status in statuses.items())

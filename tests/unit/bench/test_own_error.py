@@ -12,11 +12,11 @@ from invariant import Invariant
 from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
-from consistency.bench.filters.stepping import run_filter
+from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.montecarlo import run_log, simulate_log
-from consistency.bench.store.log import read_log
+from consistency.bench.runs.run_outcome import outcome_of
+from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import OWN_NUMBERS, joined, open_results
-from consistency.bench.store.trial_rows import outcome_of
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.column_names import OWN_COVARIANCE, POINT_COVARIANCE
 from consistency.referee.geometry.conventions import planar_error

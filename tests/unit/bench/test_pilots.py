@@ -1,25 +1,34 @@
 """Pilots of a plan are the runs that were asked for."""
 
-import numpy as np
+import json
 
-from consistency.bench.runs import sequential
+import numpy as np
+import pytest
+
+from consistency.bench.runs import montecarlo, results_to_records
+from consistency.commands.app import main
 from consistency.diagnostics import Record
 
 
-def test_a_pilot_runs_what_it_is_told(monkeypatch):
+def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
     asked = []
+    nees = np.random.default_rng(5).chisquare(3, (40, 5))
 
     def run_trials(scenario, *rest):
         asked.append((scenario.name, *rest))
         return "results"
 
-    def records_of(results, filters):
+    def records_of_results(results, filters):
         asked.append((results, filters))
-        return [Record("kf", nees=np.full((40, 5), 6.0), dof=3, t=np.arange(5.0))]
+        return (Record(name, nees=nees, dof=3, t=np.arange(5.0)) for name in filters)
 
-    monkeypatch.setattr(sequential, "run_trials", run_trials)
-    monkeypatch.setattr(sequential, "records_of", records_of)
-    ((name, (means, steps)),) = sequential.pilots_in_world("linear-gaussian", ["kf"], 40, 7).items()
-    assert asked == [("linear-gaussian", ["kf"], 40, 7), ("results", ["kf"])]
-    assert (name, steps) == ("kf", 5)
-    np.testing.assert_array_equal(means, np.full(40, 2.0))
+    monkeypatch.setattr(montecarlo, "run_trials", run_trials)
+    monkeypatch.setattr(results_to_records, "records_of_results", records_of_results)
+    filters = ["kf", "ekf-xyz"]
+    named = [word for name in filters for word in ("--filter", name)]
+    with pytest.raises(SystemExit) as end:
+        main(["plan", "linear-gaussian", *named, "--pilot-runs", "40", "--seed", "7", "--json"])
+    assert not end.value.code, capsys.readouterr().err
+    assert asked == [("linear-gaussian", filters, 40, 7), ("results", filters)]
+    like = json.loads(capsys.readouterr().out)["like"]
+    assert {name: pilot["pilot_runs"] for name, pilot in like.items()} == dict.fromkeys(filters, 40)

@@ -17,12 +17,12 @@ from consistency.bench.filters.kernel.part_functions import (
     wrap_residual,
 )
 from consistency.bench.filters.methods.ekf import sensor_of
-from consistency.bench.filters.stepping import step_through
+from consistency.bench.filters.run_filter import step_through
 from consistency.bench.models import planar
-from consistency.bench.runs.findings import sibling
+from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.run_outcome import is_flat
 from consistency.bench.simulation import draw_landmarks
-from consistency.bench.store.log import read_log, write_log
-from consistency.bench.store.trial_rows import is_flat
+from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.diagnostics import map_score
 from consistency.referee.system.provenance import manifest_of
 

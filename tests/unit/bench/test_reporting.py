@@ -22,7 +22,7 @@ from scripts import figures
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.build import answer, build_report, compose
+from consistency.bench.pages.results_report import answer, build_report, compose
 from consistency.bench.pages.sections import (
     anees,
     calibration_rates,
@@ -31,8 +31,8 @@ from consistency.bench.pages.sections import (
     one_run,
 )
 from consistency.bench.pages.sections.study_sections import without_truth
-from consistency.bench.runs.findings import Finding
 from consistency.bench.runs.montecarlo import run_log, simulate_log
+from consistency.bench.runs.reproduce_findings import Finding
 from consistency.bench.store.results import read_results
 from consistency.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.column_names import COVARIANCE
@@ -41,8 +41,8 @@ from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
 from consistency.referee.document.wording import written
-from consistency.referee.pages import by_axis, questions, verdicts
-from consistency.referee.pages.judged import clock_of
+from consistency.referee.pages import questions_table, ratio_figures, verdicts
+from consistency.referee.pages.judged_estimators import time_axis_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 
@@ -123,7 +123,7 @@ def without_studies(folder):
 
 
 def axis_caption(study):
-    return by_axis.axis_caption(study, by_axis.forests(study))
+    return ratio_figures.axis_caption(study, ratio_figures.forests(study))
 
 
 def with_tracks(report, *tracks):
@@ -245,15 +245,15 @@ def test_verdict_cells_are_the_records(report):
 
 def test_the_diagnosis_is_what_the_verdict_holds(report):
     (study,) = report.studies
-    asked = {question.name: question.answers for question in questions.asked(study)}
-    by_name = {part.name: dict(part.rows) for part in by_axis.forests(study)}
+    asked = {question.name: question.answers for question in questions_table.asked(study)}
+    by_name = {part.name: dict(part.rows) for part in ratio_figures.forests(study)}
     for number, track in enumerate(study.tracks):
         v = track.verdict
         assert {q for q, answers in asked.items() if answers[number]} == {a.question for a in v.answers}
         for one in v.answers:
             assert asked[one.question][number] is one
         assert by_name["ratio"]["x"][number] == v.axes.inflation["x"]
-        assert by_name["ratio"][by_axis.WHOLE][number] == v.scale.inflation
+        assert by_name["ratio"][ratio_figures.WHOLE][number] == v.scale.inflation
         assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * v.accuracy.coverage_one_step[1])
         assert by_name["bias"]["heading"][number] == v.bias.by_axis["heading"]
         of = nees_distribution.steps(track)
@@ -261,7 +261,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
         assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
         assert nis.lags(track) is None  # four runs of 60 steps have too few innovations
     text = "".join(Page(shown(report)).text)
-    assert all(question.name in text and question.about in text for question in questions.asked(study))
+    assert all(question.name in text and question.about in text for question in questions_table.asked(study))
 
 
 @pytest.mark.parametrize(
@@ -275,9 +275,9 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
     ],
 )
 def test_answers_have_a_mark_and_not_colour_alone(answer, cell):
-    assert questions.answer_cell(answer) == cell
-    assert cell[0] in questions.MARKS
-    assert len(set(questions.MARKS.values())) == 4
+    assert questions_table.answer_cell(answer) == cell
+    assert cell[0] in questions_table.MARKS
+    assert len(set(questions_table.MARKS.values())) == 4
 
 
 @pytest.mark.parametrize("ends", [(0.0, np.inf), (1e-12, 1e12), (19.0, 21.0)])
@@ -292,8 +292,8 @@ def test_windows_are_finite_and_hold_every_value(report, ends):
         bias=replace(v.bias, by_axis={"x": Interval(-4.0, -ends[1], ends[1])}),
     )
     study = replace(study, tracks=(replace(track, verdict=v),))
-    assert {part.name for part in by_axis.forests(study)} == {"ratio", "bias", "coverage"}
-    for part in by_axis.forests(study):
+    assert {part.name for part in ratio_figures.forests(study)} == {"ratio", "bias", "coverage"}
+    for part in ratio_figures.forests(study):
         low, high = part.window
         assert np.isfinite(part.window).all()
         values = [interval[0] for _, row in part.rows for interval in row if interval] + [part.expected]
@@ -329,8 +329,8 @@ def test_nees_alone_without_axes(report):
     whole = judge(Record("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
     study = replace(study, tracks=(track,))
-    (part,) = by_axis.forests(study)
-    assert [label for label, _ in part.rows] == [by_axis.WHOLE]
+    (part,) = ratio_figures.forests(study)
+    assert [label for label, _ in part.rows] == [ratio_figures.WHOLE]
     assert printed(replace(report, studies=(study,))).startswith(b"%PDF")
 
 
@@ -403,16 +403,16 @@ def test_consistent_has_been_shown_and_undecided_says_what_would_decide(report):
 
 
 def test_a_fault_within_the_tolerance_has_a_mark_of_its_own(report):
-    assert "≈" not in questions.marks_caption(report.studies[0])
+    assert "≈" not in questions_table.marks_caption(report.studies[0])
     error, P = drawn(3, 300, np.sqrt(1.1))
     track = judged(report.studies[0].tracks[0], error, P, Settings(0.05, tolerance=1.3))
-    marks = {a.question: questions.answer_cell(a)[0] for a in track.verdict.answers}
+    marks = {a.question: questions_table.answer_cell(a)[0] for a in track.verdict.answers}
     assert track.verdict.consistent
     assert marks["scale"] == "≈"
     assert set(marks.values()) == {"≈", "○"}
     report = with_tracks(report, track)
     assert "≈ one was found, but is shown to lie within the tolerance of ×1.3" in (
-        questions.marks_caption(report.studies[0])
+        questions_table.marks_caption(report.studies[0])
     )
     source = shown(report)
     cell = (
@@ -426,9 +426,9 @@ def test_where_only_too_small_is_a_fault_the_worst_direction_is_shown(report):
     error[..., :2] = error[..., :2] @ np.array([[1.25, 0.95], [0.95, 1.25]])  # x and y err together
     track = judged(report.studies[0].tracks[0], 0.7 * error, P, Settings(0.05, allow="conservative"))
     (study,) = with_tracks(report, track).studies
-    ratios = dict(by_axis.forests(study)[0].rows)
-    assert ratios[by_axis.DIRECTION] == (track.verdict.axes.largest,)
-    assert DIRECTION in {question.name for question in questions.asked(study) if question.answers[0].found}
+    ratios = dict(ratio_figures.forests(study)[0].rows)
+    assert ratios[ratio_figures.DIRECTION] == (track.verdict.axes.largest,)
+    assert DIRECTION in {question.name for question in questions_table.asked(study) if question.answers[0].found}
     assert "Shown inside (0,\u00a01.50]" in row(study, track)
     assert "Worst direction: chosen by one half of the runs" in axis_caption(study)
     assert "a one-sided test at 5 %, put" in verdicts.method((study,))
@@ -468,7 +468,7 @@ def test_innovations_are_judged_only_where_an_optimal_gain_is_declared(report, l
     assert_array_equal(nis.lags(kf).values, found.autocorrelation)
     assert nis.lags(silent).bound is None
     assert_array_equal(nis.lags(silent).values, found.autocorrelation)
-    asked = [question.answers for question in questions.asked(study)]
+    asked = [question.answers for question in questions_table.asked(study)]
     (innovation,) = {first.question for first, second in asked if second is None and "scale" in first.question}
     assert innovation == "innovation scale"
     assert "Only kf declares one; the innovations of the others are reported" in nis.innovations_caption(study)
@@ -534,7 +534,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert "Average NEES over 24 runs" in anees.anees_caption(anees.read(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
-    assert "asks scale alone" in questions.marks_caption(study)
+    assert "asks scale alone" in questions_table.marks_caption(study)
     shown(report)
     assert printed(report).startswith(b"%PDF")
 
@@ -804,7 +804,7 @@ def test_a_long_study_takes_a_third_of_a_megabyte_of_a_page(results, tmp_path):
     study = replace(
         report.studies[0],
         steps=np.arange(1, steps + 1),
-        clock=clock_of(0.1 * np.arange(1, steps + 1)),
+        clock=time_axis_of(0.1 * np.arange(1, steps + 1)),
         tracks=tuple(long(t) for t in report.studies[0].tracks * 2),
     )
     studies = [shown(replace(report, studies=(study,) * many)) for many in (1, 2)]
@@ -905,9 +905,9 @@ def test_the_front_end_is_what_its_tables_hold(reproduced):
 
 def test_the_forest_has_the_interval_of_each_axis_in_its_row(report):
     (study,) = report.studies
-    found = by_axis.forests(study)
-    labels = by_axis.row_labels(found)
-    drawn_panels = panels(by_axis.by_axis(study)[0])
+    found = ratio_figures.forests(study)
+    labels = ratio_figures.row_labels(found)
+    drawn_panels = panels(ratio_figures.by_axis(study)[0])
     assert [label.get_text() for label in drawn_panels[0].get_yticklabels()] == list(labels)
     for axes, forest in zip(drawn_panels, found, strict=True):
         for number, track in enumerate(study.tracks):
@@ -1017,7 +1017,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     simulate_log(uvd, 1, 0, tmp_path / "log")
     for name in ("truth", "landmarks"):
         (tmp_path / "log" / f"{name}.parquet").unlink()
-    from consistency.bench.store.log import read_log
+    from consistency.bench.store.recorded_log import read_log
 
     run_log(read_log(tmp_path / "log"), ["ekf-uvd"], jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")

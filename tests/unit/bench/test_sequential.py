@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.runs.run_until_decided import run_until_decided
 from consistency.diagnostics import Record, follow, look, sequential_design
 
 SHORT = {"truth__steps": 60}

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from consistency.bench.sweeps import regime as maps
-from consistency.bench.sweeps.regime import read_regime
+from consistency.bench.sweeps import regime_map as maps
+from consistency.bench.sweeps.regime_map import read_regime
 from consistency.referee.errors import InputError
 
 

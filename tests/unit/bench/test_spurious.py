@@ -12,7 +12,7 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario.effects import Drift, Observations
 from consistency.bench.simulation import World
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.scenario import scenario_text
 
 ALARM = 1e-6

@@ -10,17 +10,17 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.sequential import run_until_decided
+from consistency.bench.runs.run_until_decided import run_until_decided
 from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.truth_and_belief import with_changes
-from consistency.bench.sweeps import cell as cells
-from consistency.bench.sweeps import running
+from consistency.bench.sweeps import run_cell as cells
+from consistency.bench.sweeps import run_sweep as sweeping
 from consistency.bench.sweeps import sweep_folder as folders
-from consistency.bench.sweeps.axes import QUANTITIES
-from consistency.bench.sweeps.cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.plan import load_sweep, number_of_points, sweep_names
-from consistency.bench.sweeps.regime import Regime, ranked_by_cost, read_regime, regime_of, write_regime
-from consistency.bench.sweeps.running import run_sweep
+from consistency.bench.sweeps.regime_map import Regime, ranked_by_cost, read_regime, regime_of, write_regime
+from consistency.bench.sweeps.run_cell import CellResult, cost_of, run_cell
+from consistency.bench.sweeps.run_sweep import run_sweep
+from consistency.bench.sweeps.sweep_axes import QUANTITIES
+from consistency.bench.sweeps.sweep_file import load_sweep, number_of_points, sweep_names
 from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder, describe, sweep_from
 from consistency.referee.errors import InputError
 
@@ -132,6 +132,25 @@ def test_axes_that_vary_alone_are_no_product(at):
     assert [cell.number for cell in sweep.cells] == list(range(8))
     assert len(sweep.cells) == number_of_points(sweep.axes)
     assert sweep_from({"sweep": json.loads(json.dumps(describe(sweep)))}, at) == sweep
+
+
+DAMAGED = [
+    {"grid": {}, "alone": {}},
+    {"grid": {"odometry": []}},
+    {"grid": {"odometry": ["loud"]}},
+    {"grid": {"odometry": list(range(1, 20_003))}},
+    {"filters": "kf"},
+    {"seed": "a"},
+    {"rule": 5},
+    {"base": "herath2007-stereo"},
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGED, ids=lambda damage: str(damage)[:40])
+def test_a_sweep_that_was_damaged_in_its_folder_is_refused(at, damage):
+    content = describe(load_sweep("small")) | damage
+    with pytest.raises(cs.InputError, match="key 'sweep' is damaged; write it again"):
+        sweep_from({"sweep": content}, at)
 
 
 def test_a_sweep_without_a_grid_starts_from_its_base(at):
@@ -264,7 +283,7 @@ def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at, monkeypatch):
     assert hidden == [".kf.unfinished"]  # the runs of the cell; nothing else is half written
     kept = {path: path.read_bytes() for path in (at / "out").rglob("runs.csv")}
     done = []
-    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
+    monkeypatch.setattr(sweeping, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
     folder = run_sweep(sweep, at / "out", jobs=1)
     assert len(done) == 2
     assert {path: path.read_bytes() for path in kept} == kept
@@ -274,7 +293,7 @@ def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at, monkeypatch):
 def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     done = []
-    monkeypatch.setattr(running, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
+    monkeypatch.setattr(sweeping, "run_cell", lambda *a, **o: (done.append(a[2]), run_cell(*a, **o))[1])
     more = load_sweep(edited(at, "odometry = [1.0, 2.0]", "odometry = [1.0, 1.5, 2.0]"))
     folder = run_sweep(more, at / "out", jobs=1)
     assert (len(done), len(folder.results())) == (2, 6)
@@ -413,7 +432,7 @@ def test_only_consistent_filters_are_trusted():
 
 
 def test_a_report_shows_every_filter_and_cell(at):
-    from consistency.bench.pages.maps_of_worlds import LOOKS, WORDS, compose_regime
+    from consistency.bench.pages.sweep_report import LOOKS, WORDS, compose_regime
     from consistency.referee.show.as_html import render
     from consistency.referee.show.pdf import render_pdf
 
@@ -441,7 +460,7 @@ def test_a_report_shows_every_filter_and_cell(at):
 def test_a_sweep_of_one_axis_has_one_figure_of_all_filters(at):
     from painted import panels
 
-    from consistency.bench.pages.maps_of_worlds import LOOKS, compose_regime
+    from consistency.bench.pages.sweep_report import LOOKS, compose_regime
 
     sweep = load_sweep(edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "odometry = [1.0, 2.0]"))
     found = {(0, "kf"): result(rmse=0.1), (1, "kf"): result("overconfident", rmse=0.3)}
@@ -456,7 +475,7 @@ def test_a_sweep_of_one_axis_has_one_figure_of_all_filters(at):
 
 
 def test_a_map_without_numbers_on_its_axes_has_heat_maps_alone(at):
-    from consistency.bench.pages.maps_of_worlds import compose_regime
+    from consistency.bench.pages.sweep_report import compose_regime
     from consistency.referee.show.as_html import render
 
     path = edited(at, "odometry = [1.0, 2.0]\ndensity = [0.5, 1.0]", "truth.sensor.range = [[0.5, 3.0], [0.5, 4.0]]")

@@ -14,13 +14,13 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters.compiled import problem_of
-from consistency.bench.filters.stepping import run_filter, step_through
-from consistency.bench.store.log import Log
-from consistency.bench.tuning.noise_groups import groups_of, rounded, scaled, sigma_by_channel
-from consistency.bench.tuning.result import factor_text, tuning_data, tuning_lines
-from consistency.bench.tuning.scores import BeliefScorer, score_of
-from consistency.bench.tuning.split import part_of, parts_of
+from consistency.bench.filters.run_filter import run_filter, step_through
+from consistency.bench.store.recorded_log import Log
+from consistency.bench.tuning.fit_and_verdict_trials import part_of, parts_of
+from consistency.bench.tuning.innovation_likelihood import BeliefScorer, score_of_run_by_innovations
+from consistency.bench.tuning.noise_groups import noise_groups_of, rounded, scaled, sigma_by_channel
 from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
+from consistency.bench.tuning.tuning_result import factor_text, tuning_data, tuning_lines
 from consistency.commands import main
 from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
@@ -45,7 +45,7 @@ def off(scenario, q, r):
 
 def test_a_factor_scales_the_variances_of_its_channels(uvd):
     before = sigma_by_channel(uvd.belief)
-    groups = groups_of("Q.omega, R.u+R.d", uvd.belief)
+    groups = noise_groups_of("Q.omega, R.u+R.d", uvd.belief)
     assert [group.name for group in groups] == ["Q.omega", "R.u+R.d"]
     after = sigma_by_channel(scaled(uvd.belief, groups, np.log([4.0, 0.25])))
     ratios = {name: after[name] / before[name] for name in before}
@@ -55,7 +55,7 @@ def test_a_factor_scales_the_variances_of_its_channels(uvd):
 
 def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd):
     still = uvd.variant("still", belief__motion__sigma_omega=0.0)
-    assert [group.channels for group in groups_of("Q,R", still.belief)] == [("Q.v",), ("R.u", "R.v", "R.d")]
+    assert [group.channels for group in noise_groups_of("Q,R", still.belief)] == [("Q.v",), ("R.u", "R.v", "R.d")]
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_all_of_q_leaves_out_a_noise_that_is_zero(uvd):
 def test_groups_that_mean_nothing_are_refused(uvd, text, said):
     still = uvd.variant("still", belief__motion__sigma_omega=0.0)
     with pytest.raises(cs.InputError, match=f"--groups {text}".replace("+", r"\+")) as refused:
-        groups_of(text, still.belief)
+        noise_groups_of(text, still.belief)
     assert said in str(refused.value)
 
 
 def test_what_is_judged_has_the_digits_that_are_written(uvd):
-    belief = rounded(scaled(uvd.belief, groups_of("Q,R", uvd.belief), np.array([0.1, 0.2])))
+    belief = rounded(scaled(uvd.belief, noise_groups_of("Q,R", uvd.belief), np.array([0.1, 0.2])))
     assert all(value == float(f"{value:.6g}") for value in sigma_by_channel(belief).values())
 
 
@@ -91,7 +91,7 @@ def test_the_score_by_innovations_is_their_log_density(linear):
         known = info is not None and len(info.innovation)
         wanted.append(stats.multivariate_normal(cov=info.S).logpdf(info.innovation) if known else 0.0)
     for estimates in (run_filter(cs.get_filter("kf"), trial, linear.belief), step_through(twin, trial, linear.belief)):
-        score = score_of(trial, estimates)
+        score = score_of_run_by_innovations(trial, estimates)
         assert score.log_density == pytest.approx(np.array(wanted), rel=1e-9, abs=1e-8)
         assert score.dof == estimates.nis_dof.sum()
         assert score.nis == pytest.approx(np.nansum(estimates.nis))
@@ -159,7 +159,7 @@ def test_a_filter_keeps_its_process_and_takes_each_belief(uvd):
     said = set()
     with BeliefScorer(Believer(), trials, uvd.belief, 1) as bench:
         for factor in (1.0, 2.0, 3.0):
-            belief = scaled(uvd.belief, groups_of("Q", uvd.belief), np.log([factor**2]))
+            belief = scaled(uvd.belief, noise_groups_of("Q", uvd.belief), np.log([factor**2]))
             for trial in trials:
                 [estimates] = bench._isolation.run(trial, belief)
                 assert estimates.pose[-1, 0] == belief.motion.sigma_v
@@ -408,7 +408,7 @@ def test_one_robot_of_mrclam():
     folder = Path(os.environ.get("CONSISTENCY_DATA", "")) / "mrclam" / "MRCLAM_Dataset6"
     if not os.environ.get("CONSISTENCY_DATA") or not folder.is_dir():
         pytest.skip("set CONSISTENCY_DATA to the folder that holds mrclam/MRCLAM_Dataset6")
-    from consistency.bench.runs.findings import sibling
+    from consistency.bench.runs.experiment_scripts import sibling
 
     conversion = sibling(str(Path(__file__).parents[3] / "experiments/e15_mrclam.py"), "mrclam_log")
     trial, belief, _, _ = conversion.log_of(conversion.read_robot(folder, 3))

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.bench.tuning.fit import (
+from consistency.bench.tuning.noise_factor_fit import (
     LIMIT,
     UNITS,
     KnownScores,
     depth_of,
-    derivatives,
+    fit_log_factors,
     independent_sums,
-    maximise,
     profile_intervals,
+    score_derivatives,
 )
 
 SIGMAS = 4.8  # bound on a normal number, so that each assertion fails by chance in less than 1e-5 of all runs
@@ -25,7 +25,7 @@ def gaussian(z):
 
 
 def fitted(score, *starts, p=1):
-    fit = maximise(score, [np.full(p, start) for start in starts or (0.0,)])
+    fit = fit_log_factors(score, [np.full(p, start) for start in starts or (0.0,)])
     assert fit is not None
     return fit
 
@@ -93,10 +93,10 @@ def test_slope_and_curvature_are_those_of_a_parabola():
     def score(x):
         return np.full((25, 2), (7.0 - 0.5 * (x - top) @ A @ (x - top)) / 50)
 
-    slope, curvature = derivatives(KnownScores(score), np.zeros(3), [0, 1, 2])
+    slope, curvature = score_derivatives(KnownScores(score), np.zeros(3), [0, 1, 2])
     assert curvature == pytest.approx(-A, abs=1e-9)
     assert slope == pytest.approx(A @ top, abs=1e-9)
-    slope, curvature = derivatives(KnownScores(score), np.zeros(3), [0, 2])
+    slope, curvature = score_derivatives(KnownScores(score), np.zeros(3), [0, 2])
     assert slope == pytest.approx(A @ top * [1, 0, 1], abs=1e-9)
     assert curvature == pytest.approx(-A * np.outer([1, 0, 1], [1, 0, 1]), abs=1e-9)
 
@@ -131,7 +131,7 @@ def test_a_start_at_which_a_run_fails_is_left_for_the_next(rng):
 
     fit = fitted(failing, 0.0, 1.5)
     assert fit.log_factors[0] == pytest.approx(np.log((z**2).mean()), abs=1e-3)
-    assert maximise(lambda x: None, [np.zeros(1), np.ones(1)]) is None
+    assert fit_log_factors(lambda x: None, [np.zeros(1), np.ones(1)]) is None
 
 
 # --- the profile -------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.bench.store.parquet import read_parquet
-from consistency.bench.sweeps.plan import load_sweep
+from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
 from consistency.referee.system.shipped import data_folder
 from consistency.referee.verdicts.baselines import read_baseline

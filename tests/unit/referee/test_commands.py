@@ -16,7 +16,7 @@ from documents import parsed
 
 import consistency as cs
 from consistency.bench import filters
-from consistency.bench.sweeps.plan import load_sweep
+from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.commands.app import app
 from consistency.commands.registry import COMMANDS
 from consistency.commands.shared_options import print_next

@@ -13,7 +13,7 @@ from command import consistency, refused
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.fit_covariance.correction_files import place_in
 from consistency.referee.fit_covariance.fit_folder import toml
 
@@ -386,6 +386,23 @@ def test_standard_deviations_come_back_as_such(tmp_path, rng):
     assert text.splitlines()[1].split(";")[3:5] == ["7.0", "4.0"]
     assert text.splitlines()[2].split(";")[3:5] == ["", "4.0"]
     assert '"x; y"' in text
+
+
+def test_lines_come_back_with_other_covariances_alone(tmp_path):
+    """Spaces, quotes and ends of lines stay; a run that is left out, or none of the estimator, has no line."""
+    from consistency.referee.readers.formats.restated import TextFile
+
+    entries = {2: ("a", "a"), 3: ("a", "b")}
+    numbers = TextFile(tmp_path / "a.txt", entries, True, run_column=0)
+    (tmp_path / "a.txt").write_text("# t\n 1  0.5   2.0  1.0 \r\n2 0.5 2.0 1.0\n\n")
+    text = numbers.restated(lambda run, value: {"a": (4.0, 1.0), "b": (9.0, 0.0)} if run == 1 else None)
+    assert text == "# t\n 1  0.5   9.0  6.0 \r\n\n"
+    words = TextFile(tmp_path / "a.csv", entries, True, filter_column=0, filter="x, y", by_column=1)
+    (tmp_path / "a.csv").write_text('f,road,P,Q\n"x, y", "wet","2.0",\nz,dry,2.0,1.0\n')
+    values = []
+    text = words.restated(lambda run, value: values.append(value) or {"a": (4.0, 1.0)})
+    assert text == 'f,road,P,Q\n"x, y", "wet",9.0,\n'
+    assert values == ["wet"]
 
 
 def test_a_folder_is_read_in_python_as_by_the_command(tmp_path):

@@ -15,7 +15,7 @@ import consistency as cs
 from consistency.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
 from consistency.referee.diagnostics.questions import lost_runs
 from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
-from consistency.referee.diagnostics.records.validity import (  # fmt: skip
+from consistency.referee.diagnostics.records.valid_covariances import (  # fmt: skip
     DEFICIENT,
     EXACT,
     NEGATIVE,
@@ -26,7 +26,7 @@ from consistency.referee.diagnostics.records.validity import (  # fmt: skip
     negative,
 )
 from consistency.referee.diagnostics.statistics import distributions as laws
-from consistency.referee.diagnostics.statistics.accuracy import coverage
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import coverage
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
 INTERVALS = {

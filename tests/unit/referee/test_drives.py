@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.groups import spatial_error
+from consistency.referee.geometry.lie_groups import spatial_error
 from consistency.referee.readers.formats.kitti_files import mercator, read_drive
 
 

@@ -5,6 +5,7 @@ The seed of ``rng`` is fixed and was not chosen; faults are so large that a verd
 
 import itertools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ import consistency as cs
 from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
+from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.judged_filters import TERMINAL, cells, document
 from consistency.referee.document.wording import PLAIN, written
+from consistency.referee.pages.files_report import compose_files
+from consistency.referee.types import Failure
 
 
 def judged(error, **settings):
@@ -62,6 +66,17 @@ def test_the_strongest_fault_comes_first(rng):
     assert re.match(r"overconfident: covariance [a-z ]*too small by x[^;]*; mean error ", sentence)
 
 
+def test_what_the_status_says_comes_before_a_fault_that_is_surer(rng):
+    error = 2.0 * (0.5 + independent(rng, 100, 6, 3))
+    verdict = judged(error)
+    assert verdict.status == "overconfident"
+    answers = tuple(replace(a, adjusted=1e-9 if "bias" in a.question else 1e-3) for a in verdict.answers)
+    sentence = reasons(replace(verdict, answers=answers))[0]
+    assert re.match(r"overconfident: covariance about the mean too small by .*; mean error ", sentence)
+    biased = judged(0.5 + independent(rng, 100, 6, 3))
+    assert biased.reasons[0].startswith("biased: mean error ")
+
+
 def test_credibility_and_p_values_are_details(rng):
     verdict = judged(2.0 * independent(rng, 40, 6, 3))
     assert [text.split(" ")[0] for text in verdict.details] == ["noncredibility", "9"]
@@ -70,6 +85,26 @@ def test_credibility_and_p_values_are_details(rng):
         (entry,) = document({"f": verdict}, verbose=verbose).reasons
         assert set(verdict.details).isdisjoint(entry.others) is not verbose
         assert "2-sigma coverage" in " ".join(entry.others)
+
+
+def test_pages_leave_out_credibility_indices(rng):
+    """Nothing on a page of files says what they are."""
+    error = 2.0 * independent(rng, 40, 6, 3)
+    record = Record("f", error, identities(error), axes=("x", "y", "heading"))
+    document = repr(compose_files([record], {"f": judge(record)}, "f", {}))
+    assert "2-sigma coverage" in document
+    assert "noncredibility" not in document
+
+
+def test_a_verdict_that_failed_plans_no_runs(rng):
+    error = independent(rng, 20, 6, 3)
+    record = Record("f", error, identities(error))
+    settings = Settings(1e-5, detect=1.2)
+    assert judge(record, settings).reasons[0].endswith("such runs would probably decide")
+    failed = judge(replace(record, failures=(Failure("f", 3, 2, "it broke"),)), settings)
+    assert failed.status == "failed"
+    assert failed.reasons[1].startswith("no other fault found")
+    assert "would probably decide" not in " ".join(failed.reasons)
 
 
 def test_a_fault_of_a_correlation_names_the_combination(rng):

@@ -30,7 +30,7 @@ from consistency.referee.fit_covariance.writing import (
     straight,
     write_model,
 )
-from consistency.referee.geometry.groups import composed, vectors
+from consistency.referee.geometry.lie_groups import composed, vectors
 from consistency.referee.readers.options import Reading
 
 SPAN = "10m"
@@ -251,7 +251,7 @@ def test_the_command_on_tables(tmp_path, capsys):
     assert '<table class="plain wide">' in page  # on a narrow screen each axis by itself
     assert '<td data-head="held-out 10 m">' in page
     if is_installed("plot"):
-        assert page.count('<div class="chart"') == 2
+        assert page.count('<div class="chart"') == 1
         assert "<figcaption>Errors of corrected motions" in page
     said = json.loads(consistency(capsys, *words, "--json", "--held-out", "run 3")[0])
     assert said["fitted_drives"] == ["run 1", "run 2"]

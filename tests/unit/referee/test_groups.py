@@ -15,11 +15,11 @@ from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.planning.single_log import in_pieces
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.scale import ratio_interval, scale_test, weighted_of
-from consistency.referee.diagnostics.records.groups import Column, column_of, groups_of, on_steps
-from consistency.referee.diagnostics.records.outcome import made_from_errors, selects_on_outcome
+from consistency.referee.diagnostics.records.groups_by_column import Column, column_of, groups_of, on_steps
+from consistency.referee.diagnostics.records.outcome_columns import made_from_errors, selects_on_outcome
 from consistency.referee.diagnostics.statistics.number_of_runs import group_runs, power_of, required_runs
 from consistency.referee.diagnostics.verdict.answers import GROUP, SHARES, shares_of
-from consistency.referee.pages.by_group import by_group
+from consistency.referee.pages.ratio_figures import ratio_by_group_figure
 
 
 def errors(runs=40, steps=20, n=2, seed=1):
@@ -293,14 +293,14 @@ def test_the_plan_counts_on_the_share_of_groups():
 
 
 def test_the_figure_has_a_row_for_each_group():
-    (figure,) = by_group(verdict_by(wrong_in_the_first()[2]))
+    (figure,) = ratio_by_group_figure(verdict_by(wrong_in_the_first()[2]))
     assert figure.title == "By mode"
     (axes,) = figure.drawings[0]().axes
     assert [label.get_text() for label in axes.get_yticklabels()] == [
         "mode <= 0", "0 < mode <= 1", "1 < mode <= 2", "mode > 2",
     ]  # fmt: skip
     assert axes.get_xlim()[1] > 3.0
-    assert by_group(cs.judge(*errors())) == ()
+    assert ratio_by_group_figure(cs.judge(*errors())) == ()
 
 
 # --- what selects on the outcome ------------------------------------------------------------------------------

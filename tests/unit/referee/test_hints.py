@@ -14,7 +14,7 @@ from consistency.diagnostics import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.groups import composed, matrices, spatial_error, vectors
+from consistency.referee.geometry.lie_groups import composed, matrices, spatial_error, vectors
 from consistency.referee.notebook.read_and_judge import judge, read
 from consistency.referee.readers.alignment.world_frames import (
     BodyTransform,

@@ -22,7 +22,7 @@ from consistency.diagnostics import (
 )
 from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
-from consistency.referee.gating.watch import RunningTest, watching
+from consistency.referee.gating.gate_terms import RunningTest, watching
 from consistency.referee.types import Failure
 from consistency.testing import InsufficientTrials, assert_consistent
 

@@ -28,7 +28,7 @@ from consistency.referee.diagnostics.verdict.answers import (
 )
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import ratio_text
-from consistency.referee.gating.found import GateResult, runs_to_decide
+from consistency.referee.gating.gate_results import GateResult, runs_to_decide
 from consistency.referee.types import Failure
 
 RUNS = 24

@@ -12,10 +12,10 @@ from painted import legend_of, places, shaded
 from consistency.referee.document.blocks import Document, Figure
 from consistency.referee.document.colours import EXPECTED, LIMIT, Look, style
 from consistency.referee.show import as_html
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     LIMIT as MOST,
 )
-from consistency.referee.show.painting import (
+from consistency.referee.show.matplotlib_style import (
     NARROWEST,
     TITLE,
     add_legend,

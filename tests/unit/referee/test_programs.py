@@ -76,6 +76,32 @@ def test_only_known_braces_are_replaced():
     assert filled("{run}{seed}-{other} {{run}} {here}/x {input}", values) == "712-{other} {7} /a b/x {input}"
 
 
+@pytest.mark.parametrize(
+    "words, name",
+    [
+        (["./filter", "sim.py"], "./filter"),
+        (["{here}/filter"], "filter"),
+        (["/bin/sh"], "sh"),
+        (["sh", "-u", "{here}/sim.sh", "{seed}"], "sim.sh"),
+        (["sh", "-c", "sim.sh; sim.py"], "sh"),
+        (["sh", "tables/0.csv"], "sh"),
+    ],
+)
+def test_a_program_is_called_as_its_user_does(place, words, name):
+    script(place, "", "sim.sh")
+    assert program_of(words, place).name == name
+
+
+def test_a_study_of_before_is_called_after_its_file(place, capsys):
+    assert monte_carlo("--runs", "3", "--out", "out", "--", "./filter", "{run}", capsys=capsys)[0] == 0
+    assert cs.read(place / "out").name == "./filter"
+    path = place / "out/manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["program"]
+    path.write_text(json.dumps(manifest))
+    assert cs.read(place / "out").name == "estimates"
+
+
 def test_words_come_as_they_are(place, capsys):
     script(place, f'{COPY}; shift; printf "%s\\n" "$@" > words', "say")
     odd = ["two words", "{other} {seed", "a\"b'c", "$HOME `ls` *", "ünï→", "", "--flag", "--"]
@@ -189,7 +215,7 @@ def test_a_right_program_is_consistent_and_a_bold_one_is_not(place, capsys):
     status, out, _ = monte_carlo(*judged, *words, capsys=capsys)
     (verdict,) = json.loads(out).values()
     assert (status, verdict["status"]) == (1, "overconfident")
-    assert "failure" in (place / "j.xml").read_text()
+    assert '<testcase classname="./brave" name="./brave">\n<failure' in (place / "j.xml").read_text()
     assert "overconfident" in (place / "r.md").read_text()
     assert monte_carlo(*judged, *words, capsys=capsys)[0] == 1  # replaces all of them
 
@@ -207,9 +233,9 @@ def test_the_folder_is_read_by_other_commands(place, capsys):
     assert "40 of 40 runs have the same seed and truth in both" in out
     assert "run by run" in out
     planned = json.loads(consistency("plan", "--like", "out", "--json", capsys=capsys)[1])
-    assert planned["like"]["estimates"]["pilot_runs"] == 40
+    assert planned["like"]["./filter"]["pilot_runs"] == 40
     assert consistency("report", "out", "--html", "r.html", capsys=capsys)[0] == 0
-    assert "estimates" in (place / "r.html").read_text()
+    assert "./filter is " in (place / "r.html").read_text()
 
 
 def test_runs_of_other_seeds_are_compared_as_independent(place, capsys):
@@ -240,7 +266,7 @@ def test_looks_end_the_runs_and_the_folder_keeps_them(place, capsys):
         words = ("--until-decided", "--jobs", jobs, "--json", "--out", f"of{jobs}", "--", "./brave", "{run}")
         status, said[jobs], err = monte_carlo(*words, capsys=capsys)
         assert status == 0
-        assert "12 runs: estimates overconfident" in err
+        assert "12 runs: ./brave overconfident" in err
     assert said["1"] == said["2"]
     assert len(run_files(place / "of1", "run.json")) == 12
     assert len(list((place / "of2/runs").iterdir())) == len(run_files(place / "of2", "run.json"))
@@ -254,7 +280,7 @@ def test_looks_need_whole_covariances(place, capsys):
     script(place, 'cut -d, -f1-8,11,13 "$CONSISTENCY_HERE/tables/$1.csv" > estimates.csv')  # variances alone
     words = ("--overwrite", "--out", "out", "--", "./filter", "{run}")
     status, _, err = monte_carlo("--until-decided", *words, capsys=capsys)
-    assert (status, "--until-decided: estimates has components" in err) == (2, True)
+    assert (status, "--until-decided: ./filter has components" in err) == (2, True)
     assert monte_carlo("--runs", "12", *words, capsys=capsys)[0] == 0
 
 
@@ -278,8 +304,8 @@ def test_one_run_for_each_recorded_file(place, capsys):
     words = ("--each", "est/*", "--truth", "truth/{name}.csv", "--json", "--out", "two", "--", "cp", "{input}")
     status, out, err = monte_carlo(*words, "estimates.csv", capsys=capsys)
     assert status == 0, err
-    beside = json.loads(consistency("analyse", "out", "--json", capsys=capsys)[1])["estimates"]
-    assert json.loads(out)["estimates"]["reasons"] == beside["reasons"]
+    beside = json.loads(consistency("analyse", "out", "--json", capsys=capsys)[1])["cp"]
+    assert json.loads(out)["cp"]["reasons"] == beside["reasons"]
     folder = consistency("analyse", "est", "--truth", "truth", *OF_STATE, "--json", capsys=capsys)[1]
     assert json.loads(folder)["est"]["reasons"] == beside["reasons"]
 
@@ -572,5 +598,5 @@ def test_the_gate(place):
         assert_program_consistent(["./filter", "{run}"], runs=4, **options)
     write_tables(place, 70, 4.0, "bold")
     script(place, COPY.replace("tables", "bold"), "brave")
-    with pytest.raises(ConsistencyError, match=re.escape("assert_program_consistent: estimates is overconfident")):
+    with pytest.raises(ConsistencyError, match=re.escape("assert_program_consistent: ./brave is overconfident")):
         assert_program_consistent(["./brave", "{run}"], **options)

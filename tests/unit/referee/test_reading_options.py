@@ -1,7 +1,7 @@
 """Options of files: one record for readers, commands and Python; tables in memory are read as files of them are."""
 
 import inspect
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,9 @@ from numpy.testing import assert_allclose
 from recorded import read_recordings
 
 import consistency as cs
+from consistency.diagnostics import Record
 from consistency.referee.readers.options import MAX_DT, Reading, flag_of
+from consistency.referee.readers.pipeline.read_files import own_names
 from consistency.testing import assert_consistent
 
 
@@ -121,6 +123,54 @@ def test_a_table_is_read_as_its_file(wrap, tmp_path):
     mixed = cs.read(wrap(own), truth=tmp_path / "truth.csv", state=["a", "b"])
     assert_allclose(mixed.nees, files.nees, rtol=1e-9)
     assert record.name == "estimates"
+
+
+def test_columns_are_called_as_their_user_does(tmp_path):
+    """In the verdict; the record keeps the names by which blocks are known and files are compared."""
+    own, truth = frames()
+    own = own.rename(columns={"a": "pos_n", "b": "pos_e"})
+    columns = {"a": "pos_n", "b": "pos_e"}
+    verdict = cs.judge(cs.read(own, truth=truth, state=["a", "b"], columns=columns))
+    assert verdict.statistics["axes"] == ("pos_n", "pos_e")
+    assert {"pos_n", "pos_e"} <= set(verdict.axes.inflation)
+    record = cs.read(own, truth=truth, state=["a", "b"], columns=columns)
+    assert (record.axes, record.names) == (("a", "b"), ("pos_n", "pos_e"))
+
+
+@pytest.mark.parametrize(
+    "of_record, columns, align, names",
+    [
+        ({}, {"x": "pos_n", "v*": "vel_*"}, None, ("pos_n", "y", "vel_x")),
+        ({}, {"P*": "C*", "t": "stamp"}, None, ("x", "y", "vx")),
+        ({"convention": "left"}, {"x": "pos_n"}, None, ("x", "y", "vx")),
+        ({"window": "10 s"}, {"x": "pos_n"}, None, ("x", "y", "vx")),
+        ({}, {"x": "pos_n"}, "posyaw", ("x", "y", "vx")),
+    ],
+)
+def test_components_have_names_of_columns_whose_error_is_theirs(of_record, columns, align, names):
+    record = replace(Record("f", axes=("x", "y", "vx"), convention="so3"), **of_record)
+    own = own_names(record, Reading(columns=columns, align=align))
+    assert replace(record, own_names=own).names == names
+
+
+def test_blocks_are_known_whatever_their_axes_are_called(rng):
+    record = Record("f", rng.standard_normal((30, 5, 4)), np.eye(4), axes=("x", "y", "heading", "vx"))
+    record = replace(record, covariance=np.broadcast_to(np.eye(4), (30, 5, 4, 4)), own_names={"x": "n", "y": "e"})
+    verdict = cs.judge(record)
+    assert verdict.statistics["groups"]["position"] == [0, 1]
+    assert verdict.accuracy.rmse_position == pytest.approx(np.hypot(*verdict.accuracy.rmse[:2]))
+    parts = cs.judge(replace(record, parts=((0, 1), (2,), (3,))))
+    assert list(parts.parts) == ["n, e", "heading", "vx"]
+
+
+def test_a_truth_that_is_named_in_part_is_said_not_to_be_used(tmp_path):
+    own, truth = frames()
+    own["true_a"], own["nis"], own["nis_dof"] = truth["a"], 1.0, 2
+    record = cs.read(own, state=["a", "b"])
+    assert record.error is None
+    assert any("only the NIS is read" in note and "column 'true_b' is missing" in note for note in record.notes)
+    own["true_b"] = truth["b"]
+    assert not any("only the NIS" in note for note in cs.read(own, state=["a", "b"]).notes)
 
 
 def test_missing_values_and_filters(tmp_path):

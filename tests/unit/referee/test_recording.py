@@ -23,9 +23,9 @@ from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import planar_error, se2_log
-from consistency.referee.geometry.groups import se3_log, spatial_error
+from consistency.referee.geometry.lie_groups import se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 ROOT = Path(__file__).parents[3]
 POSE_COLUMNS = ["P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]

@@ -502,7 +502,7 @@ FAULTS = {
     "correlated in a step": (
         correlated_in_a_step, "shape in some step", (*WRONG, *OVER, *UNDER), "covariance of the wrong shape",
     ),
-    "heavy-tailed": (heavy_tailed, "outliers", HEAVY, "heavy tails: "),
+    "heavy-tailed": (heavy_tailed, "outliers", HEAVY, "outlier in run "),
     "coloured innovations": (
         lambda case, rng: case | {"u": autoregression(rng, RUNS, STEPS, 2, 0.3)},
         "innovation whiteness", WRONG, "innovations correlated over steps",

@@ -17,12 +17,12 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 import consistency as cs
 from consistency.referee.diagnostics.questions.independence import ENOUGH
 from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.geometry.groups import composed, matrices, propagated, to_left
+from consistency.referee.geometry.lie_groups import composed, matrices, propagated, to_left
 from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative
 from consistency.referee.verdicts.baselines import baseline
 from consistency.referee.verdicts.compare_sources import compare_with
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
 SURE = 1e-5  # false-alarm rate of a verdict in a test

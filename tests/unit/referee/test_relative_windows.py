@@ -10,10 +10,10 @@ from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stre
 
 import consistency as cs
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
-from consistency.referee.geometry.groups import adjoint, composed, inverse, log, matrices, spatial_error, to_left
+from consistency.referee.geometry.lie_groups import adjoint, composed, inverse, log, matrices, spatial_error, to_left
 from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.windows import Relative, relative_of, windows
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 GROUPS = tuple(world.SIGMA)
 NEXT = Relative(1, "step")

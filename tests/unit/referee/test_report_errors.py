@@ -7,9 +7,9 @@ from invariant import Invariant
 
 import consistency as cs
 from consistency.bench.pages import write_reports
-from consistency.bench.pages.build import build_report
+from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections import anees
-from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_errors
+from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_error_table
 from consistency.referee.document.blocks import Name, Quantity, Status, Table
 from consistency.referee.document.judged_filters import page
 from consistency.referee.document.wording import brief, written
@@ -42,7 +42,7 @@ def rows_of(blocks):
 def test_both_errors_stand_below_each_other(study):
     track = study.tracks[1]
     v = track.verdict
-    own, world = rows_of(own_errors(study))
+    own, world = rows_of(own_error_table(study))
     name = Name("right", track.look)
     assert own[:4] == (name, "right, its own", Status(v.status), Quantity(v.scale.mean_anees))
     assert world[:4] == ("", "so2, additive", Status(v.world.status), Quantity(v.world.scale.mean_anees))
@@ -57,7 +57,7 @@ def test_captions_name_the_filters_with_an_error_of_their_own(study):
     alone = replace(study, tracks=study.tracks[:1])
     assert "own" not in anees.anees_caption(anees.read(alone)).replace("shown", "")
     assert "error of their own" not in verdicts.verdicts_caption(alone)
-    assert own_errors(alone) == ()
+    assert own_error_table(alone) == ()
 
 
 def test_the_rmse_is_that_of_the_pose_in_the_world(study):

@@ -16,10 +16,10 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.document.blocks import Details, Figure, Table, Text
 from consistency.referee.pages.files_report import compose_files
-from consistency.referee.pages.judged import clock_of
+from consistency.referee.pages.judged_estimators import time_axis_of
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, unit_of
 from consistency.referee.pages.trajectory import shown_run
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 RUNS, STEPS = 30, 25
 
@@ -106,7 +106,7 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive):
 
 def test_without_times_steps_are_on_the_axis(tmp_path, rng):
     np.savez(tmp_path / "e.npz", **errors_of(rng))
-    clock = clock_of(read_recordings(tmp_path / "e.npz")[0].t)
+    clock = time_axis_of(read_recordings(tmp_path / "e.npz")[0].t)
     assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
     assert unit_of("axis 0") == ("", 1.0)
 

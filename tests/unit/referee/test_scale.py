@@ -490,6 +490,10 @@ def test_by_betting(allow, ratio):
     assert (too_large < too_small) == (ratio < 1)
     assert result.p_value == pytest.approx(too_large if allow else max(too_large, too_small))
     assert (result.factor, result.level, result.runs) == (d, pytest.approx(0.05), None)
+    low, high = result.interval
+    assert ever(e_process(means / low, 3).up) == pytest.approx(0.05, rel=1e-3)
+    assert ever(e_process(means / high, 3).down) == pytest.approx(0.05, rel=1e-3)
+    assert low < ratio < high
 
 
 def test_of_innovations():
@@ -501,8 +505,10 @@ def test_of_innovations():
     one = equivalence_of_total(total, 400, Settings(allow="conservative", power=0.9), d)
     assert one.p_value == pytest.approx(expected[0], rel=1e-9)
     assert one.level == pytest.approx(0.1)
+    assert both.interval == pytest.approx(total / stats.chi2.ppf([0.95, 0.05], 400), rel=1e-4)
     nothing = equivalence_of_total(float("nan"), 0, Settings(), d)
     assert np.isnan(nothing.p_value)
+    assert nothing.interval is None
     assert not nothing.shown
 
 

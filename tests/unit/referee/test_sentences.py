@@ -93,7 +93,7 @@ def test_opposite_axes_are_inconsistent(rng, factors):
     small, large = AXES[int(np.argmax(factors))], AXES[int(np.argmin(factors))]
     sentence = verdict.reasons[0]
     said = re.search(
-        rf"too small by x([\d.]+) \[[^]]+\] in {small}, (?:.*, )?too large by x([\d.]+) \[[^]]+\]", sentence
+        rf"too small by x([\d.]+) \[[^]]+\] in {small}, (?:.*?, )??too large by x([\d.]+) \[[^]]+\]", sentence
     )
     assert float(said[1]) == pytest.approx(max(factors), rel=0.1)
     assert float(said[2]) == pytest.approx(1.0 / min(factors), rel=0.1)
@@ -132,9 +132,7 @@ def test_few_large_errors_do_not_hide_that_the_mean_is_small(times, status):
     assert (verdict.scale.inflation.high < 1.0) == (status == "inconsistent")
     assert verdict.status == status
     if status == "inconsistent":
-        assert re.search(
-            r"covariance too large by x[\d.]+ .*\(ratio 0\.\d\d\); heavy tails: the runs", verdict.reasons[0]
-        )
+        assert re.search(r"covariance too large by x[\d.]+ .*\(ratio 0\.\d\d\); the runs differ", verdict.reasons[0])
 
 
 def test_an_axis_nearer_to_one_than_the_whole_leaves_it_overconfident(rng):
@@ -142,7 +140,9 @@ def test_an_axis_nearer_to_one_than_the_whole_leaves_it_overconfident(rng):
     assert verdict.status == "overconfident"
     sentence = verdict.reasons[0]
     assert re.search(
-        r"too small by x1\.\d\d \[.*, mainly x.*, but too large by x1\.\d\d \[[^]]+\] \(ratio 0\.\d\d\) in y", sentence
+        r"too small by x1\.\d\d \[[^]]+\](?:, first .*)?; x too small by x\d\.\d\d \[[^]]+\], "
+        r"y too large by x1\.\d\d \[[^]]+\] \(ratio 0\.\d\d\)",
+        sentence,
     )
 
 

@@ -27,7 +27,7 @@ from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.verdicts.sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all
 
 SETTINGS = Settings()
 SURE = 1e-5

@@ -11,7 +11,7 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.diagnostics import Record
-from consistency.referee.diagnostics.records.skipping import Skip, Skipped, skip_of, without_first
+from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse

@@ -145,6 +145,20 @@ def test_consistent_needs_the_interval_of_the_estimate():
     assert sure.status == "consistent"
 
 
+@pytest.mark.parametrize("errors", [None, "independent", "common"])
+def test_the_interval_of_the_estimate_shows_what_the_tests_show(errors):
+    one = record(np.random.default_rng(1), "white", 0.2, 1.0, errors, runs=200)
+    shown = judge(one).equivalence
+    low, high = shown.interval
+    assert low < high
+    assert shown.shown == (low > 1.0 / shown.factor and high < shown.factor)
+    for detect, inside in ((max(high, 1.0 / low) * 1.001, True), (max(high, 1.0 / low) * 0.999, False)):
+        assert judge(one, Settings(detect=detect)).equivalence.shown == inside
+    assert (
+        judge(record(np.random.default_rng(1), "white", 0.2, 1.0, None, shared=True)).equivalence.interval[1] == np.inf
+    )
+
+
 def _sum(one):
     assert one.error is not None
     return one.error, np.asarray(one.covariance) + one.truth_covariance

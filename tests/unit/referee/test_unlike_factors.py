@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.judging import error_parts
 from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.verdict.parts import ComponentRatios, Interval
 from consistency.referee.diagnostics.words.sentences import reasons
-from consistency.referee.diagnostics.words.unlike_factors import block_text, unlike_text
+from consistency.referee.diagnostics.words.unlike_factors import factors_text, unlike_text
 
 SURE = 1e-5
 INERTIAL = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
@@ -121,7 +121,7 @@ def test_a_block_that_is_too_small_is_named_with_its_own_factor(rng):
     verdict = judge(inertial(rng, [4.0, 1.0, 1.0]), Settings(SURE))
     assert {"shape", "shape in some step"} & set(verdict.faults)
     found = re.fullmatch(
-        rf"overconfident: covariance too small by x({NUMBER}) \[.*?\]: position too small by x({NUMBER}) "
+        rf"overconfident: covariance too small by x({NUMBER}) \[.*?\]; position too small by x({NUMBER}) "
         rf"\[({NUMBER}), ({NUMBER})\], attitude and velocity right; no bias found",
         verdict.reasons[0].split("; without")[0],
     )
@@ -166,21 +166,36 @@ def test_a_correlation_is_named_only_if_it_is_shown_to_be_wrong(rng):
     assert "correlation of the wrong sign: -0.6" in reasons(verdict)[0]
     unshown = reasons(replace(verdict, shape=replace(verdict.shape, shown=False)))[0]
     assert "correlation" not in unshown
-    assert unshown.startswith("inconsistent: covariance of the wrong shape; no axis by itself is wrong")
+    assert unshown.startswith("inconsistent: covariance of the wrong shape")
 
 
-def test_the_status_depends_on_the_pair_farthest_off(rng, monkeypatch):
-    """A pair that is shown to be wrong is named before it."""
-    shown = np.zeros((3, 3), bool)
-    shown[0, 2] = shown[2, 0] = True
-    monkeypatch.setattr(error_parts, "_shown_pairs", lambda *_: shown)
+@pytest.mark.parametrize(
+    "shown, pair, status",
+    [([], (0, 1), "overconfident"), ([(0, 2)], (0, 2), "overconfident"), ([(0, 1), (0, 2)], (0, 1), "inconsistent")],
+)
+def test_the_status_depends_on_pairs_that_are_shown(rng, monkeypatch, shown, pair, status):
+    """The sign of x and y alone is wrong: a pair that is shown is named before it, unless it is shown, too."""
+    are_shown = np.zeros((3, 3), bool)
+    for i, j in shown:
+        are_shown[i, j] = are_shown[j, i] = True
+    monkeypatch.setattr(error_parts, "_shown_pairs", lambda *_: are_shown)
     verdict = judge(opposite_signs(rng), Settings(SURE))
-    assert (verdict.shape.pair, verdict.shape.shown, verdict.shape.wrong_sign) == ((0, 2), True, False)
+    assert (verdict.shape.pair, verdict.shape.shown) == (pair, bool(shown))
+    assert verdict.shape.alone == verdict.shape.wrong_sign == (status == "inconsistent")
+    assert verdict.status == status
+
+
+def test_a_wrong_sign_is_named_before_a_correlation_that_is_farther_off(rng):
+    true = np.array([[1.0, -0.3, 0.8], [-0.3, 1.0, 0.0], [0.8, 0.0, 1.0]])
+    stated = np.array([[1.0, 0.3, 0.0], [0.3, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    error = independent(rng, 200, 30, 3) @ np.linalg.cholesky(true).T
+    verdict = judge(Record("f", error, np.broadcast_to(stated, (200, 30, 3, 3))), Settings(SURE))
+    assert verdict.shape.pair == (0, 1)
     assert verdict.shape.alone
     assert verdict.status == "inconsistent"
 
 
-def of(ratios, status="overconfident", subset=None):
+def of(ratios, status="overconfident", subset=None, allow=None):
     """Findings with these ratios of axes, and blocks of them where they are given."""
     names = tuple(name for name in ratios if name not in ("position", "attitude", "velocity"))
     groups = {name: [i] for i, name in enumerate(names)}
@@ -188,7 +203,9 @@ def of(ratios, status="overconfident", subset=None):
         if block in ratios:
             groups[block] = [i for i, name in enumerate(names) if name in members]
     axes = ComponentRatios(names, groups, {name: Interval(*ratio) for name, ratio in ratios.items()})
-    return SimpleNamespace(axes=axes, status=status, settings=Settings(), location=SimpleNamespace(subset=subset))
+    return SimpleNamespace(
+        axes=axes, status=status, settings=Settings(allow=allow), location=SimpleNamespace(subset=subset)
+    )
 
 
 RIGHT = (1.0, 0.9, 1.1)
@@ -198,14 +215,17 @@ FAR = (2.0, 1.8, 2.2)
 def test_a_block_is_named_only_if_its_axes_are_alike():
     alike = {"x": FAR, "y": (1.9, 1.6, 2.3), "position": FAR, "heading": RIGHT}
     text = "position too small by x2.00 [1.80, 2.20], heading right"
-    assert block_text(of(alike)) == text
-    assert block_text(of(alike, subset="x")) == block_text(of(alike, subset="x, y")) == text
-    assert block_text(of(alike, subset="heading")) == ""
+    assert factors_text(of(alike)) == text
+    assert factors_text(of(alike, subset="x")) == factors_text(of(alike, subset="x, y")) == text
+    assert factors_text(of(alike, subset="heading")) == ""
     of_correlation = {"x": RIGHT, "y": RIGHT, "position": (3.0, 2.5, 3.5), "heading": RIGHT}
-    assert block_text(of(of_correlation)) == ""
+    assert factors_text(of(of_correlation)) == ""
     single = alike | {"y": RIGHT}
-    assert block_text(of(single, subset="x")) == ""
-    assert unlike_text(of(single)) == "x too small by x2.00 [1.80, 2.20], y and heading right"
+    assert (
+        factors_text(of(single, subset="x"))
+        == unlike_text(of(single))
+        == "x too small by x2.00 [1.80, 2.20], y and heading right"
+    )
 
 
 def test_factors_that_may_be_the_same_are_not_named():
@@ -224,6 +244,14 @@ def test_nothing_in_a_conservative_covariance_has_to_grow():
     ratios = {"x": (0.4, 0.35, 0.45), "y": FAR}
     assert unlike_text(of(ratios, "conservative")) == "x too large by x2.50 [2.22, 2.86] (ratio 0.40)"
     assert "y too small" in unlike_text(of(ratios, "inconsistent"))
+    assert unlike_text(of(ratios, allow="conservative")) == "y too small by x2.00 [1.80, 2.20]"
+
+
+def test_a_side_is_said_once_and_both_sides_are():
+    small, large = (1.6, 1.5, 1.7), (0.8, 0.7, 0.9)
+    assert unlike_text(of({"x": FAR, "y": small})) == ("x too small by x2.00 [1.80, 2.20], y by x1.60 [1.50, 1.70]")
+    many = {"x": FAR, "y": FAR, "z": FAR, "vx": FAR, "vy": large}
+    assert re.sub(r" by x[^]]*]", "", unlike_text(of(many))) == "x too small, y, vy too large (ratio 0.80)"
 
 
 # --- velocity ------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from scipy import stats
 import consistency as cs
 from consistency.diagnostics import Answer, Equivalence, Interval, Record, Settings, Verdict, anees_interval
 from consistency.diagnostics import judge as judge_evidence
-from consistency.referee.diagnostics.records.skipping import Skip, Skipped
+from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
 from consistency.referee.diagnostics.verdict.answers import (
     ABOUT,

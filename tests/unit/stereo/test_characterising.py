@@ -17,8 +17,8 @@ from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import characterise
 from consistency.stereo.characterising.coordinate_fit import Levels, moving_over_rest, rate, tails
-from consistency.stereo.characterising.likelihood import Parameters, Rows, fit, regress
-from consistency.stereo.characterising.log_residuals import Residuals, octaves, residuals_of, select
+from consistency.stereo.characterising.likelihood import Likelihood, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.truth_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))
@@ -124,7 +124,7 @@ def test_the_scatter_of_tracks_is_that_of_their_scores(rng, tracks, length, memo
     residuals = (rows.r - rows.X @ found.regression.beta).reshape(tracks, length)
 
     def by_track(theta):
-        p = Parameters.of(theta, max(rows.length, 1.0))
+        p = Likelihood(rows, memory=True).parameters(theta)
         V = p.a[0] ** 2 * (p.rho**lag + p.ratio)
         return np.asarray(stats.multivariate_normal(cov=V).logpdf(residuals)).reshape(tracks)
 
@@ -143,7 +143,7 @@ def test_a_fit_is_the_top_of_the_likelihood(rng):
     for k in range(3):
         for sign in (-1.0, 1.0):
             theta = found.theta + sign * 0.02 * np.eye(3)[k]
-            other = regress(rows, Parameters.of(theta, rows.length))
+            other = regress(rows, Likelihood(rows, memory=True).parameters(theta))
             assert other.value < found.regression.value
 
 

@@ -13,15 +13,15 @@ from consistency.bench.scenario import Mount, PicturedSensor
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising.boards import (
-    Calibrated,
+    BoardCalibration,
     Corners,
     calibrate,
     find_corners,
     residuals_about_boards,
 )
+from consistency.stereo.characterising.fitted_tracks import HIDDEN, characterise_posed, correlations, log_interval
 from consistency.stereo.characterising.from_log import seen_of as seen_of_log
-from consistency.stereo.characterising.known_poses import characterise_posed, correlations, log_interval
-from consistency.stereo.characterising.unknown_landmarks import Seen, fit_points, without_gross
+from consistency.stereo.characterising.point_fit import Sightings, fit_points, without_gross
 
 F, B = 400.0, 0.1
 SIGMA = np.array([0.5, 0.8, 0.3])
@@ -44,7 +44,7 @@ def seen_of(rng, tracks, length, rho=0.0, sigma=SIGMA, still=False):
     for i in range(1, length):
         e[:, i] = rho * e[:, i - 1] + np.sqrt(1 - rho**2) * e[:, i]
     values = np.stack(stereo.project(x, y, z, F, B), axis=-1) + e.reshape(-1, 3) * sigma
-    return Seen(values, R, t, track, k, np.full(len(k), not still))
+    return Sightings(values, R, t, track, k, np.full(len(k), not still))
 
 
 def parts(seen):
@@ -100,7 +100,7 @@ def test_tracks_of_unlike_noise_make_the_interval_wider(rng):
     """Half of the tracks have three times the noise: squares scatter by tracks, as chi-square does not know."""
     seen = seen_of(rng, 200, 12)
     ideal = fit_points(seen, F, B, parts(seen), np.ones(3)).ideal
-    unlike = Seen(
+    unlike = Sightings(
         ideal + (seen.z - ideal) * np.where(seen.track % 2, 3.0, 1.0)[:, None], *list(vars(seen).values())[1:]
     )
     width = []
@@ -125,11 +125,18 @@ def test_correlation_is_found_and_not_that_of_the_fit(rng):
     assert 0.3 < interval.low < interval.value < 0.65
 
 
+def test_a_note_says_where_correlation_makes_sigma_a_lower_limit(rng):
+    """By chance it is missing only if a correlation of 0.9 looks like none, which is 30 standard errors away."""
+    of = characterise_posed(seen_of(rng, 200, 30, rho=0.9), SENSOR, "here")
+    assert of.coordinates[0].white is False
+    assert HIDDEN in of.notes
+
+
 def test_a_track_with_a_mismatch_is_left_out_as_a_whole(rng):
     seen = seen_of(rng, 100, 8)
     z = seen.z.copy()
     z[8 * 7 + 3, 2] += 9.0
-    wrong = Seen(z, *list(vars(seen).values())[1:])
+    wrong = Sightings(z, *list(vars(seen).values())[1:])
     good = without_gross(fit_points(wrong, F, B, parts(seen), np.ones(3)))
     assert (~good).sum() == 8
     assert set(seen.track[~good]) == {7}
@@ -157,7 +164,7 @@ def test_growth_and_sigma_of_tracks_in_one_characterisation(rng):
 def test_what_a_step_shares_is_named(rng):
     seen = seen_of(rng, 400, 10)
     shake = rng.standard_normal((10, 3)) * [0.0, 1.0, 0.0]
-    shaken = Seen(seen.z + shake[seen.step], *list(vars(seen).values())[1:])
+    shaken = Sightings(seen.z + shake[seen.step], *list(vars(seen).values())[1:])
     still = [note for note in characterise_posed(seen, SENSOR, "here").notes if "share" in note]
     note = next(note for note in characterise_posed(shaken, SENSOR, "here").notes if "share" in note)
     v = float(note.split("v ")[1].split(",")[0])
@@ -169,7 +176,7 @@ def test_errors_of_poses_are_no_noise_where_poses_are_free(rng):
     seen = seen_of(rng, 400, 8)
     shake = 0.002 * rng.standard_normal((8, 6))
     R = seen.R @ Rotation.from_rotvec(shake[seen.step, :3]).as_matrix()
-    wrong = Seen(seen.z, R, seen.t + shake[seen.step, 3:], *list(vars(seen).values())[3:])
+    wrong = Sightings(seen.z, R, seen.t + shake[seen.step, 3:], *list(vars(seen).values())[3:])
     held, free = (fit_points(wrong, F, B, parts(seen), np.ones(3), free_poses) for free_poses in (False, True))
     half = 5.5 / np.sqrt(2 * 400 * 7)
     assert (np.abs(np.log(free.sigma / SIGMA)) < half).all()
@@ -234,7 +241,7 @@ def test_the_noise_of_corners_is_that_about_their_plane(rng):
     nine = np.isin(board()[:, 0], [0.0, 0.12, 0.24]) & np.isin(board()[:, 1], [0.0, 0.06, 0.15])
     ideal = np.stack([np.stack(stereo.project(*points[nine].T, F, B), axis=-1) for points in boards(rng, 120)])
     z = ideal + rng.standard_normal(ideal.shape) * SIGMA
-    calibrated = Calibrated("full", z, np.zeros(z.shape[:2]), F, B, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
+    calibrated = BoardCalibration("full", z, np.zeros(z.shape[:2]), F, B, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
     data = residuals_about_boards(calibrated, board()[nine])
     chi2 = float((data.r**2 / SIGMA**2).sum())
     assert abs(chi2 / 3240 - 1.0) < 5.5 * np.sqrt(2 / 3240) < 6 / 27

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 import consistency as cs
 from consistency.bench.models import planar, point, stereo
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
-from consistency.bench.store.log import Log
+from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
-from consistency.referee.pages.origin import facts
+from consistency.referee.pages.manifest_facts import facts
 from consistency.stereo.visual_odometry import common_motion
 from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
 

@@ -10,9 +10,16 @@ from painted import by_title, legend_of, lines, panels, titles
 from scripts import experiment, figures
 
 import consistency as cs
-from consistency.bench.pages import build
-from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections.exhibits import P_VALUE, STATUS, Exhibit, Source, listing, shown
+from consistency.bench.pages import results_report
+from consistency.bench.pages.results_report import build_report
+from consistency.bench.pages.sections.published_findings import (
+    P_VALUE,
+    STATUS,
+    Exhibit,
+    Source,
+    exhibit_blocks,
+    listing,
+)
 from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table, Text
 
 images, sensor_issues = figures("images"), figures("sensor_issues")
@@ -36,7 +43,7 @@ def rows_of(table):
 
 
 def issues(folder):
-    return shown(build_report(folder), sensor_issues.EXHIBITS)
+    return exhibit_blocks(build_report(folder), sensor_issues.EXHIBITS)
 
 
 def test_every_finding_on_the_sensor_has_one_exhibit_with_its_name_as_title():
@@ -55,14 +62,14 @@ def test_an_exhibit_has_its_own_findings_and_none_without_a_table(tmp_path):
     exhibits = (Exhibit(("a", "b"), "a, b: two", (Source("first", ("x",), (), numbers),)),
                 Exhibit(("c",), "c: one", (Source("second", ("x",), (), numbers),)))  # fmt: skip
     folder = written(tmp_path / "out", {"first": pd.DataFrame({"x": [1.25]})}, ("c", "b", "a"))
-    heading, findings, table = shown(build_report(folder), exhibits)
+    heading, findings, table = exhibit_blocks(build_report(folder), exhibits)
     assert heading == Heading("a, b: two")
     assert [row[0] for row in rows_of(findings)] == [Stack("b", (), bold=True), Stack("a", (), bold=True)]
     assert "Accepted if: rule of b" in [line.text for line in rows_of(findings)[0][1].below]
     assert rows_of(findings)[0][-1] == Status("reproduced")
     assert rows_of(table) == (("1.2",),)
     (folder / "first.parquet").unlink()
-    assert shown(build_report(folder), exhibits) == ()
+    assert exhibit_blocks(build_report(folder), exhibits) == ()
 
 
 def test_chapters_of_scripts_stand_on_paper_as_they_say(tmp_path, monkeypatch):
@@ -70,12 +77,12 @@ def test_chapters_of_scripts_stand_on_paper_as_they_say(tmp_path, monkeypatch):
         return SimpleNamespace(CHAPTER=(name, name.title(), "Entry"), ON_PAPER=on_paper, blocks=lambda _: (Text("x"),))
 
     scripts = {"first": script("first", True), "second": script("second", False)}
-    monkeypatch.setattr(build, "figure_scripts", lambda: scripts)
+    monkeypatch.setattr(results_report, "figure_scripts", lambda: scripts)
     report = build_report(written(tmp_path / "out", {}, ("a",)))
-    first, second = build._of_experiments(report, brief=True)
+    first, second = results_report._of_experiments(report, brief=True)
     assert (first.anchor, first.title, first.link, first.on_paper) == ("first", "First", "Entry", None)
     assert second.on_paper == ()
-    assert [chapter.on_paper for chapter in build._of_experiments(report, brief=False)] == [None, None]
+    assert [chapter.on_paper for chapter in results_report._of_experiments(report, brief=False)] == [None, None]
 
 
 def test_a_listing_writes_text_numbers_and_verdicts():
@@ -153,4 +160,4 @@ def test_a_bias_map_is_drawn_row_by_row(tmp_path):
 def test_a_table_that_lacks_a_column_is_refused(tmp_path, name, module):
     folder = written(tmp_path / "out", {name: pd.DataFrame({"filter": ["x"]})})
     with pytest.raises(cs.InputError, match=rf"{name}\.parquet: column '\w+' is missing"):
-        shown(build_report(folder), module.EXHIBITS)
+        exhibit_blocks(build_report(folder), module.EXHIBITS)

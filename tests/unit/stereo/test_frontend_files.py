@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.geometry import rotation
-from consistency.stereo.frontend.dataset_truth import read_truth
+from consistency.stereo.frontend.camera_truth import read_truth
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration, read_kitti
 from consistency.stereo.visual_odometry.cameras.camera_pair import rectify
 from consistency.stereo.visual_odometry.sequence import read_image, read_sequence

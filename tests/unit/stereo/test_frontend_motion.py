@@ -13,11 +13,11 @@ from recorded import read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.bench.store.log import read_log
-from consistency.referee.geometry.groups import spatial_error
+from consistency.bench.store.recorded_log import read_log
+from consistency.referee.geometry.lie_groups import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
-from consistency.stereo.frontend.dataset_truth import read_truth
+from consistency.stereo.frontend.camera_truth import read_truth
 from consistency.stereo.frontend.planar_log import (
     CAMERA,
     in_robot_axes,

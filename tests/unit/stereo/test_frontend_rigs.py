@@ -13,12 +13,12 @@ from scene import BASELINE, SIZE, K, drive, texture, write_kitti
 
 import consistency as cs
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
-from consistency.bench.store.log import read_log
+from consistency.bench.store.recorded_log import read_log
 from consistency.bench.types import Trial
 from consistency.referee.geometry import rotation
 from consistency.referee.readers.formats.kitti_files import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
-from consistency.stereo.frontend.dataset_truth import find_truth, missing_of_drive, read_truth
+from consistency.stereo.frontend.camera_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.frontend.planar_log import plane_of
 from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.cameras.camera_pair import rectify

@@ -6,15 +6,15 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
-from consistency.stereo.rendered_images.calibration import (
+from consistency.stereo.rendered_images.camera import StereoCamera
+from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
+from consistency.stereo.rendered_images.sensor_tables import (
     Biases,
     Growth,
     bias_map,
     disparity_growth,
     track_means,
 )
-from consistency.stereo.rendered_images.camera import StereoCamera
-from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
 from consistency.stereo.rendered_images.stages import Spread
 from consistency.stereo.rendered_images.stops import Stops, stand
 

@@ -8,8 +8,8 @@ from painted import by_title, lines, panels
 from scripts import experiment, figures
 
 import consistency as cs
-from consistency.bench.pages.build import build_report
-from consistency.bench.pages.sections.exhibits import shown
+from consistency.bench.pages.results_report import build_report
+from consistency.bench.pages.sections.published_findings import exhibit_blocks
 from consistency.referee.document.blocks import Heading, Table
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
 from consistency.stereo.rendered_images.scene import Layer, Scene
@@ -78,7 +78,7 @@ def test_tracks_and_their_report(moving, noise, tmp_path):
     noise.main(study)
     study.write(tmp_path / "out", found, 0.0)
     report = build_report(tmp_path / "out")
-    blocks = shown(report, images.EXHIBITS)
+    blocks = exhibit_blocks(report, images.EXHIBITS)
     figures = {title: panels(figure) for title, figure in by_title(blocks).items()}
     tables = {block.label: block for block in blocks if isinstance(block, Table)}
     headings = [block.text for block in blocks if isinstance(block, Heading)]
@@ -125,9 +125,9 @@ def test_a_report_without_images_has_no_section(tmp_path):
     study.tables["images_exp1"] = pd.DataFrame({"frame": [0.0], "tracks": [3.0], "rms_u": [0.1]})
     study.write(tmp_path / "out", [], 0.0)
     with pytest.raises(cs.InputError, match=r"images_exp1\.parquet: column 'rms_v' is missing"):
-        shown(build_report(tmp_path / "out"), images.EXHIBITS)
+        exhibit_blocks(build_report(tmp_path / "out"), images.EXHIBITS)
     (tmp_path / "out" / "images_exp1.parquet").unlink()
-    assert not shown(build_report(tmp_path / "out"), images.EXHIBITS)
+    assert not exhibit_blocks(build_report(tmp_path / "out"), images.EXHIBITS)
 
 
 def test_a_junction_ranks_above_a_point(moving):

@@ -9,7 +9,7 @@ from scripts import experiment
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
 from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.log_residuals import Residuals
+from consistency.stereo.characterising.truth_residuals import Residuals
 
 SIGMA = (0.2, 0.15, 0.3)
 

@@ -7,7 +7,7 @@ from scipy import stats
 from scripts import experiment
 
 import consistency as cs
-from consistency.bench.pages.build import build_report
+from consistency.bench.pages.results_report import build_report
 from consistency.vision import RelativePose
 
 rigs, front_end = experiment("published_rig"), scripts.figures("front_end")

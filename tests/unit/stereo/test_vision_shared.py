@@ -12,7 +12,8 @@ import consistency as cs
 from consistency.referee.diagnostics.imperfect_truth.shared_errors import posterior
 from consistency.referee.errors import InputError
 from consistency.stereo.visual_odometry.odometry import bridged
-from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
+from consistency.stereo.visual_odometry.resection import diagonal_covariances
 from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
 from consistency.vision import RelativePose, StereoRig, refine_reprojection
 

@@ -13,8 +13,8 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, LIMIT
-from consistency.referee.pages.judged import wide
-from consistency.referee.show.painting import add_legend, band, canvas, curve, edges, log_axis, stroke
+from consistency.referee.pages.judged_estimators import wide
+from consistency.referee.show.matplotlib_style import add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from consistency.bench.pages.sections.exhibits import extra_table
+from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
 from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, table
 from consistency.referee.document.wording import brief

@@ -12,8 +12,8 @@ from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import BAND, EXPECTED, Look
-from consistency.referee.pages.judged import wide
-from consistency.referee.show.painting import canvas, dots, log_axis, owned, points, say, stroke
+from consistency.referee.pages.judged_estimators import wide
+from consistency.referee.show.matplotlib_style import canvas, dots, log_axis, owned, points, say, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -51,16 +51,16 @@ def innovations(study: Study) -> tuple[Figure, ...]:
 
 def _draw(study: Study, track: Track) -> Drawing:
     if not any(map(lags, study.tracks)):
-        figure, (sizes,) = canvas(1.3)
+        figure, (nis_axes,) = canvas(1.3)
     else:
-        figure, (sizes, correlation) = canvas(1.3, 2, 2, width_ratios=(2.4, 1.0))
+        figure, (nis_axes, correlation) = canvas(1.3, 2, 2, width_ratios=(2.4, 1.0))
         _draw_correlation(correlation, track)
-    sizes.axhline(1.0, **stroke(ONE))
-    points(sizes, study.clock.values, track.nis_ratio, replace(track.look, size=1.6, alpha=0.7), "", track.tag)
-    sizes.set(ylabel="NIS / dof", title=track.name)
-    study.clock.span(sizes)
+    nis_axes.axhline(1.0, **stroke(ONE))
+    points(nis_axes, study.clock.values, track.nis_ratio, replace(track.look, size=1.6, alpha=0.7), "", track.tag)
+    nis_axes.set(ylabel="NIS / dof", title=track.name)
+    study.clock.span(nis_axes)
     if wide([track.nis_ratio]):
-        log_axis(sizes, "y")
+        log_axis(nis_axes, "y")
     return figure
 
 

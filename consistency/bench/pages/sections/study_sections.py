@@ -21,8 +21,8 @@ from consistency.referee.document.judged_filters import FURTHER as FURTHER_COLUM
 from consistency.referee.document.map import COLUMNS as MAP_COLUMNS
 from consistency.referee.document.map import map_cells
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
-from consistency.referee.pages.by_axis import by_axis
-from consistency.referee.pages.questions import diagnosis
+from consistency.referee.pages.questions_table import diagnosis
+from consistency.referee.pages.ratio_figures import by_axis
 
 OF_FURTHER = (
     "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "
@@ -66,7 +66,7 @@ def further(study: Study) -> tuple[Block, ...]:
     return Heading("Further figures", 4), table(heads, rows, label, caption=OF_FURTHER, whole=whole)
 
 
-def own_errors(study: Study) -> tuple[Block, ...]:
+def own_error_table(study: Study) -> tuple[Block, ...]:
     """Filters with an error of their own: what is judged in it, and beside it in the additive error of the world."""
     rows: list[tuple[Cell, ...]] = []
     for track in study.tracks:
@@ -114,5 +114,5 @@ def rejections(study: Study) -> tuple[Block, ...]:
 
 SECTIONS: tuple[Callable[[Study], tuple[Block, ...]], ...] = (
     anees_curves, without_truth, world_map, pose_errors, innovations, diagnosis, by_axis, nees_distribution, further,
-    own_errors, maps, rejections,
+    own_error_table, maps, rejections,
 )  # fmt: skip

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.stepping import error_of, name_of, reason_of, rejects
+from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
+from consistency.bench.filters.run_filter import reason_of
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.isolation.process_start import begin, nothing
 from consistency.bench.runs.isolation.worker import Isolated, load, run
@@ -256,9 +257,9 @@ def _reason(code: int | None) -> str:
     """How a process ended."""
     if code is None or code >= 0:
         return f"its process ended with exit status {code}"
-    outside = ", from outside or because memory ran out" if code in KILLED else ""
-    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    return f"its process was killed by {name}{outside}"
+    from_outside = ", from outside or because memory ran out" if code in KILLED else ""
+    signal_name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"its process was killed by {signal_name}{from_outside}"
 
 
 def _isolated(filter_: Filter) -> Isolated:
@@ -285,30 +286,30 @@ def _folder() -> str:
 
 def _show(printed: Connection) -> None:
     """Pass what the filters in a process print on to standard error, up to ``SHOWN`` bytes, and drop the rest."""
-    left = SHOWN
+    bytes_left = SHOWN
     with contextlib.suppress(OSError, EOFError):
-        while text := os.read(printed.fileno(), 2**16):
-            if left > 0:
-                os.write(2, text[:left])
-                if len(text) > left:
+        while printed_text := os.read(printed.fileno(), 2**16):
+            if bytes_left > 0:
+                os.write(2, printed_text[:bytes_left])
+                if len(printed_text) > bytes_left:
                     os.write(
                         2, f"\nconsistency: filters print more than {SHOWN} bytes; the rest is not shown\n".encode()
                     )
-                left -= len(text)
+                bytes_left -= len(printed_text)
 
 
 def _start_tracker() -> None:
     """Start loky's tracker of semaphores, which removes those of a process that is killed, without its warning."""
     from joblib.externals.loky.backend import resource_tracker
 
-    before = os.environ.get("PYTHONWARNINGS")
+    warnings_before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
     try:
         resource_tracker.ensure_running()
     finally:
         del os.environ["PYTHONWARNINGS"]
-        if before is not None:
-            os.environ["PYTHONWARNINGS"] = before
+        if warnings_before is not None:
+            os.environ["PYTHONWARNINGS"] = warnings_before
 
 
 def dismiss() -> None:

@@ -10,9 +10,9 @@ from consistency.bench.scenario.effects.effect import EFFECTS, ListedEffect, reg
 from consistency.bench.scenario.effects.gross_errors import HeavyTails as HeavyTails
 from consistency.bench.scenario.effects.gross_errors import Mismatch as Mismatch
 from consistency.bench.scenario.effects.gross_errors import Swap as Swap
-from consistency.bench.scenario.effects.junction import Junction as Junction
 from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth, LocalBias
 from consistency.bench.scenario.effects.observations import Context, Observations
+from consistency.bench.scenario.effects.occlusion_junctions import Junction as Junction
 from consistency.bench.scenario.effects.selection import Selection as Selection
 from consistency.bench.scenario.effects.track_errors import Drift as Drift
 from consistency.bench.scenario.effects.track_errors import TrackError as TrackError

@@ -55,8 +55,8 @@ class ListedEffect(Table):
             raise PydanticCustomError("union_tag_not_found", "kind is missing", context)
         effect = EFFECTS.get(str(data["kind"]))
         if effect is None:
-            known = ", ".join(f"'{kind}'" for kind in sorted(EFFECTS)) or "the known kinds: there are none yet"
-            context["expected_tags"] = known
+            known_kinds = ", ".join(f"'{kind}'" for kind in sorted(EFFECTS)) or "the known kinds: there are none yet"
+            context["expected_tags"] = known_kinds
             raise PydanticCustomError("union_tag_invalid", "'{tag}' is not one of {expected_tags}", context)
         # as a tagged union would, with the kind in the location of an error
         effects = TypeAdapter[dict[str, ListedEffect]](dict[str, effect])  # type: ignore[valid-type]

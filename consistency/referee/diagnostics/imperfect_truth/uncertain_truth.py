@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import optimize
@@ -240,8 +240,11 @@ class UncertainTruth:
             share = self.share()
             if self.contrasted:
                 share = 0.0
-            return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, share=share)
-        return equivalent(self.below(ratio=factor), self.above(ratio=1.0 / factor), factor, settings, None)
+            return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, share=share, is_whole=True)
+        ratio = float("nan")
+        if len(self.by_group[MAIN]):
+            ratio = (float(self.total.means().mean()) - self.share()) / (1.0 - self.share())
+        return equivalent(partial(self.below, MAIN), partial(self.above, MAIN), ratio, factor, settings)
 
     # --- output -----------------------------------------------------------------------------------
 

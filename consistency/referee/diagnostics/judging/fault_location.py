@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.band import Band
+from consistency.referee.diagnostics.questions.anees_band import Band
 from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import pointwise_band, ratio_interval, run_means
 from consistency.referee.diagnostics.statistics import distributions
@@ -51,8 +51,8 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
         last = until(sample, band, detect)
     return Location(
         simultaneous=np.stack([band.low, band.high], axis=-1),
-        above=int(band.above.sum()),
-        below=int(band.below.sum()),
+        steps_above=int(band.above.sum()),
+        steps_below=int(band.below.sum()),
         first_outside=first_outside,
         first_step=first_step,
         since=since,

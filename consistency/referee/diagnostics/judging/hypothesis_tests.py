@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.band import Band, simultaneous_band
+from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import StepMoments, hotelling, step_moments, t_squared
 from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.questions.sample import Sample
@@ -113,8 +113,8 @@ def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
         return ()
     tests = []
     for number in range(len(sample.groups.names)):
-        found = sample.in_group(number)
-        tests.append(scale_test(found.means, sample.dof, found.longest, weights=found.counts))
+        in_group = sample.in_group(number)
+        tests.append(scale_test(in_group.means, sample.dof, in_group.longest, weights=in_group.counts))
     return tuple(tests)
 
 

@@ -110,27 +110,27 @@ def findings_of(
             p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
     if inspection is not None:
         p_values = inspection.corrected(p_values)
-    given = tuple(answers(p_values, settings.false_alarm).values())
-    given = with_tolerated(given, _tolerated(joint, innovations, settings))
+    given_answers = tuple(answers(p_values, settings.false_alarm).values())
+    given_answers = with_tolerated(given_answers, _tolerated(joint, innovations, settings))
 
     parts = ErrorParts()
     lost = None
     ends = None
     impossible: list[tuple[int, int]] = []
-    left_out: list[int] = []
+    left_out_steps: list[int] = []
     if sample is not None and tests is not None:
-        given = excused(given, sample, tests, settings)
-        shown = _equivalence(sample, both_sides, inspection, record, truth)
-        parts = error_parts(record, sample, tests, given, settings, shown)
+        given_answers = excused(given_answers, sample, tests, settings)
+        scale_equivalence = _equivalence(sample, both_sides, inspection, record, truth)
+        parts = error_parts(record, sample, tests, given_answers, settings, scale_equivalence)
         lost = lost_of(record, sample.nees, sample.dof, settings, any_time=inspection is not None)
         if record.landmarks is None:
             ends = _early_ends(sample)
         if sample.whitened is not None:
             impossible = _impossible(record, sample)
-            left_out = _left_out_steps(record, sample)
+            left_out_steps = _left_out_steps(record, sample)
     broken = bool(record.failures or impossible or (joint is not None and joint.score.not_definite))
 
-    faults = set(faults_of(given))
+    faults = set(faults_of(given_answers))
     if nothing_judged(parts.scale, innovations):
         status = "failed"
     elif not faults:
@@ -138,12 +138,12 @@ def findings_of(
     elif sample is None or tests is None:
         status = status_by_innovations(faults, innovations, settings)
     else:
-        status = status_by_errors(given, settings, sample, tests, joint, parts)
+        status = status_by_errors(given_answers, settings, sample, tests, joint, parts)
     share = None
     if truth is not None:
         share = truth.truth_share()
-        status = truth.status(status, given, settings)
-        parts = _parts_of_estimate(truth, parts, given, settings)
+        status = truth.status(status, given_answers, settings)
+        parts = _parts_of_estimate(truth, parts, given_answers, settings)
     unshown, status, scale = withheld(unshown, status, parts.scale)
     later = status == "consistent" and inspection is not None and inspection.spent is None
     if later:
@@ -154,10 +154,10 @@ def findings_of(
         runs=runs,
         steps=steps,
         settings=settings,
-        answers=given,
+        answers=given_answers,
         failures=record.failures,
         impossible=tuple(impossible),
-        left_out_steps=tuple(left_out),
+        left_out_steps=tuple(left_out_steps),
         **parts._replace(scale=scale)._asdict(),
         innovations=innovations,
         landmarks=record.landmarks,
@@ -189,10 +189,10 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
         whiteness,
     )
 
-    found = nis_and_dof(record)
-    if found is None:
+    innovations = nis_and_dof(record)
+    if innovations is None:
         return None, {}
-    nis, dof = found
+    nis, dof = innovations
     test = nis_test(nis, dof)
     interval = UNKNOWN_ENDS
     if test.dof:

@@ -79,18 +79,18 @@ def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> 
 def _records_of_parts(record: Record) -> dict[str, Record]:
     """A record of the errors of each part, and one of the innovations if they are judged."""
     names = names_of(record)
+    axes = record.axes or names
     assert record.error is not None
     covariance = np.asarray(record.covariance, float)
     records = {}
     for index in record.parts:
         some = list(index)
-        axes = tuple(names[i] for i in index)
-        records[", ".join(axes)] = replace(
+        records[", ".join(names[i] for i in index)] = replace(
             record,
             error=record.error[..., some],
             covariance=covariance[..., some, :][..., some],
             dof=len(some),
-            axes=axes,
+            axes=tuple(axes[i] for i in index),
             parts=(),
             nis=None,
             nis_dof=None,

@@ -76,10 +76,10 @@ def correlation_time(series: Array) -> tuple[float, int]:
     if not covariance[0] > 0:
         return 1.0, 1
     tau = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    enough = np.arange(T) >= REACH * tau
+    window_reached = np.arange(T) >= REACH * tau
     lag = T - 1
-    if enough.any():
-        lag = int(np.argmax(enough))
+    if window_reached.any():
+        lag = int(np.argmax(window_reached))
     return max(1.0, float(tau[lag])), max(lag, 1)
 
 
@@ -127,11 +127,11 @@ def memory_of(whitened: Array) -> ErrorMemory:
     w = whitened[np.isfinite(whitened).all(axis=1)]
     if len(w) < 2:
         return ErrorMemory(len(whitened), np.inf, np.inf)
-    sizes = np.square(w).sum(axis=1)
+    nees = np.square(w).sum(axis=1)
     longest = 0.0
     upper = 0.0
     z = float(special.ndtri(CONFIDENCE))
-    for series in (*w.T, sizes - sizes.mean()):
+    for series in (*w.T, nees - nees.mean()):
         time, reach = correlation_time(series)
         longest = max(longest, time)
         upper = max(upper, time * float(np.exp(z * np.sqrt(2.0 * (2.0 * reach + 1.0) / len(w)))))
@@ -160,10 +160,10 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         raise InputError(f"--split: {record.name} failed in step {record.failures[0].step}; cut the log before that")
     P = np.asarray(record.covariance, float)
     whitened = whiten(record.error, P)[0]
-    there = np.flatnonzero(np.isfinite(whitened).all(axis=1))
-    if not len(there):
+    whitened_steps = np.flatnonzero(np.isfinite(whitened).all(axis=1))
+    if not len(whitened_steps):
         raise InputError(f"--split: {record.name} has no step that can be judged")
-    log = slice(int(there[0]), int(there[-1]) + 1)
+    log = slice(int(whitened_steps[0]), int(whitened_steps[-1]) + 1)
     _require_steady(record, P[0, log])
     memory = memory_of(whitened[log])
     pieces = count
@@ -173,7 +173,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     if length < 1:
         raise InputError(f"--split {pieces}: {record.name} has only {memory.steps} steps")
     end = log.start + pieces * length
-    parts = whitened[log.start : end].reshape(pieces, length, -1)
+    whitened_pieces = whitened[log.start : end].reshape(pieces, length, -1)
     arrays = {
         name: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
         for name, array in arrays_of(record).items()
@@ -194,7 +194,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         groups=None if record.groups is None else record.groups.in_pieces(slice(log.start, end), pieces),
         t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION,
         notes=(*record.notes, note),
-        unavailable=BIAS, unshown=_unshown(memory, pieces, length, parts),
+        unavailable=BIAS, unshown=_unshown(memory, pieces, length, whitened_pieces),
     )  # fmt: skip
 
 
@@ -204,7 +204,7 @@ def _require_steady(record: Record, P: Array) -> None:
     if min(map(len, blocks)) == 0:
         return
     medians = np.array([np.nanmedian(block, axis=0) for block in blocks])
-    names = record.axes or numbered_axes(medians.shape[1])
+    names = record.names or numbered_axes(medians.shape[1])
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
         signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]

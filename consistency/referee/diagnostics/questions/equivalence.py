@@ -63,33 +63,41 @@ def equivalence(
     def p_above(ratio: float) -> float:
         return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, False, weights).above
 
-    below = p_below(factor)
-    above = p_above(1.0 / factor)
-    interval = None
-    if is_whole and len(means) and not share:
-        interval = interval_of_tests(p_below, p_above, float(np.average(means, weights=weights)), 1.0 - settings.power)
+    ratio = float("nan")
+    if is_whole and len(means):
+        ratio = (float(np.average(means, weights=weights)) - share) / (1.0 - share)
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
         runs = deciding_runs(scale_test(means, dof, steps, False, weights), nearer, settings, low_is_fault)
-    return replace(equivalent(below, above, factor, settings, runs), interval=interval)
+    return equivalent(p_below, p_above, ratio, factor, settings, runs)
 
 
-def interval_of_tests(
-    below: Callable[[float], float], above: Callable[[float], float], ratio: float, level: float
-) -> tuple[float, float] | None:
-    """Ratios that are excluded by neither of two one-sided tests, whose p values are ``below`` and ``above``.
+def equivalent(
+    below: Callable[[float], float],
+    above: Callable[[float], float],
+    ratio: float,
+    factor: float,
+    settings: Settings,
+    runs: int | None = None,
+) -> Equivalence:
+    """Equivalence by two one-sided tests, with the interval of the ratios that neither excludes.
 
-    It lies inside [1 / factor, factor] where :func:`equivalence` is shown. None where it holds no ``ratio``.
+    The interval lies inside [1 / factor, factor] where equivalence is shown.
 
     Parameters
     ----------
     below, above : p values of the ratio being as large as a number, or as small
-    ratio : that is estimated
+    ratio : that is estimated; without one above 0 there is no interval
     """
-    if not (ratio > 0 and np.isfinite(ratio)):
-        return None
-    return _end(above, ratio, -1.0, level), _end(below, ratio, 1.0, level)
+    p_value = below(factor)
+    if not settings.one_sided:
+        p_value = max(p_value, above(1.0 / factor))
+    level = 1.0 - settings.power
+    interval = None
+    if ratio > 0 and np.isfinite(ratio):
+        interval = _end(above, ratio, -1.0, level), _end(below, ratio, 1.0, level)
+    return Equivalence(factor, float(p_value), level, runs, settings.one_sided, interval)
 
 
 def _end(p_value: Callable[[float], float], ratio: float, sign: float, level: float) -> float:
@@ -119,10 +127,17 @@ def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equiva
     means : (runs,), mean over its steps of each run's NEES over ``dof``
     dof : components of the error
     """
-    factor = settings.factor
-    below = ever(e_process(means / factor, dof).down)
-    above = ever(e_process(means * factor, dof).up)
-    return equivalent(below, above, factor, settings, None)
+
+    def below(ratio: float) -> float:
+        return ever(e_process(means / ratio, dof).down)
+
+    def above(ratio: float) -> float:
+        return ever(e_process(means / ratio, dof).up)
+
+    mean = float("nan")
+    if len(means):
+        mean = float(means.mean())
+    return equivalent(below, above, mean, settings.factor, settings)
 
 
 def equivalence_of_total(total: float, dof: int, settings: Settings, factor: float) -> Equivalence:
@@ -132,20 +147,19 @@ def equivalence_of_total(total: float, dof: int, settings: Settings, factor: flo
     """
     if not dof:
         return Equivalence(factor, float("nan"), 1.0 - settings.power, None)
-    below = float(distributions.chi2.cdf(total / factor, dof))
-    above = float(distributions.chi2.sf(total * factor, dof))
-    return equivalent(below, above, factor, settings, None)
+
+    def below(ratio: float) -> float:
+        return float(distributions.chi2.cdf(total / ratio, dof))
+
+    def above(ratio: float) -> float:
+        return float(distributions.chi2.sf(total / ratio, dof))
+
+    return equivalent(below, above, total / dof, factor, settings)
 
 
 def is_tolerated(total: float, dof: int, settings: Settings) -> bool:
     """Whether the ratio is shown to lie within the tolerance, see :func:`equivalence_of_total`."""
     return settings.tolerance is not None and equivalence_of_total(total, dof, settings, settings.tolerated).shown
-
-
-def equivalent(below: float, above: float, factor: float, settings: Settings, runs: int | None) -> Equivalence:
-    """Equivalence by the p values of the ratio being ``factor`` or more, and its inverse or less."""
-    p_value = below if settings.one_sided else max(below, above)
-    return Equivalence(factor, float(p_value), 1.0 - settings.power, runs, settings.one_sided)
 
 
 def worst(parts: Sequence[Equivalence]) -> Equivalence:

@@ -69,9 +69,9 @@ def independence(whitened: Array, nees: Array | None = None) -> Independence:
     w = whitened[there]
     if len(w) < FEWEST:
         return Independence(len(w), float("nan"), float("nan"), True)
-    sizes = np.cbrt(np.square(w).sum(axis=1) if nees is None else nees[there])[:, None]
+    error_sizes = np.cbrt(np.square(w).sum(axis=1) if nees is None else nees[there])[:, None]
     shares = np.array([ALIKE, 1.0 - ALIKE])
-    of_sizes = _low_and_high(sizes - sizes.mean(), True) / (SIZES * shares)
+    of_sizes = _low_and_high(error_sizes - error_sizes.mean(), True) / (SIZES * shares)
     of_signs = _low_and_high(w, False) / ((1.0 - SIZES) * shares)
     clearer = of_sizes if of_sizes.min() <= of_signs.min() else of_signs
     p_sizes, p_signs = (min(1.0, float(p.min())) for p in (of_sizes, of_signs))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,13 +12,13 @@ import numpy as np
 from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.validity import negative
+from consistency.referee.diagnostics.records.valid_covariances import negative
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.records.groups_by_column import Groups
 
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}
@@ -77,11 +77,15 @@ class Sample:
     @property
     def reported(self) -> dict[str, list[int]]:
         """The components and velocity, whose ratio is reported and not tested."""
-        velocity = [i for i, axis in enumerate(self.names) if axis in VELOCITY]
+        velocity = self.members(VELOCITY)
         components = dict(self.components)
         if 1 < len(velocity) < len(self.names):
             components.setdefault("velocity", velocity)
         return components
+
+    def members(self, axes: Collection[str]) -> list[int]:
+        """Places of components that are some of the ``axes``, whatever the user calls them."""
+        return [i for i, axis in enumerate(self.record.axes) if axis in axes]
 
     @property
     def groups(self) -> Groups | None:
@@ -180,11 +184,12 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
-    return Sample(record, nees, error.shape[-1], whitened, names, component_groups(names, settings.subsets))
+    sample = Sample(record, nees, error.shape[-1], whitened, names)
+    return replace(sample, components=component_groups(sample, settings.subsets))
 
 
 def names_of(record: Record) -> tuple[str, ...]:
-    """Names of the components of the error; axis 0, axis 1, ... where they have none.
+    """Names of the components of the error, the user's own before others; axis 0, axis 1, ... where they have none.
 
     Raises
     ------
@@ -197,14 +202,15 @@ def names_of(record: Record) -> tuple[str, ...]:
         return numbered_axes(n)
     if len(record.axes) != n:
         raise ValueError(f"{len(record.axes)} names of axes for {n} components")
-    return tuple(record.axes)
+    return record.names
 
 
-def component_groups(names: tuple[str, ...], subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
+def component_groups(sample: Sample, subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
     """Each component, position and attitude where they are more than one and not all, and the subsets."""
+    names = sample.names
     groups = {axis: [i] for i, axis in enumerate(names)}
     for label, members in (("position", POSITION), ("attitude", ATTITUDE)):
-        index = [i for i, axis in enumerate(names) if axis in members]
+        index = sample.members(members)
         if 1 < len(index) < len(names):
             groups[label] = index
     for label, chosen in (subsets or {}).items():

@@ -14,8 +14,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
-    from consistency.referee.diagnostics.records.skipping import Skip, Skipped
+    from consistency.referee.diagnostics.records.groups_by_column import Groups
+    from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,7 @@ class Record:
     optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
     failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
     axes: Sequence[str] = ()  # names of the n components, if they have any
+    own_names: Mapping[str, str] = field(default_factory=dict)  # of axes, what the user calls them, as a verdict does
     # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
     # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
     parts: tuple[tuple[int, ...], ...] = ()
@@ -142,6 +143,11 @@ class Record:
         return np.arange(next((len(array) for array in there if array is not None), 0))
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """What a verdict calls the axes: the user's own names where he has some."""
+        return tuple(self.own_names.get(axis, axis) for axis in self.axes)
+
+    @property
     def in_world(self) -> Record:
         """The same runs with their errors as differences in the world: this record where it has no others."""
         if self.world is None:
@@ -178,7 +184,7 @@ class Record:
         """
         if skip is None:
             return self
-        from consistency.referee.diagnostics.records.skipping import without_first
+        from consistency.referee.diagnostics.records.skipped_start import without_first
 
         arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
         world = self.world
@@ -213,7 +219,8 @@ class Record:
         return Record(
             self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
             self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            axes=self.axes, parts=self.parts, runs=number[there], unit="window", skipped=self.skipped,
+            axes=self.axes, own_names=self.own_names, parts=self.parts, runs=number[there], unit="window",
+            skipped=self.skipped,
             groups=None if self.groups is None else self.groups[there, None],
         )  # fmt: skip
 

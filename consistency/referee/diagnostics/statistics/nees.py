@@ -14,7 +14,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM
 from consistency.referee.diagnostics.records.large_arrays import by_steps
-from consistency.referee.diagnostics.records.validity import asymmetric
+from consistency.referee.diagnostics.records.valid_covariances import asymmetric
 from consistency.referee.diagnostics.records.whitening import mean_and_count, spread_steps, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array

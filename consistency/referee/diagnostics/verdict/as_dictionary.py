@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.skipping import Skipped
+from consistency.referee.diagnostics.records.skipped_start import Skipped
 from consistency.referee.diagnostics.verdict.parts import (
     Bias,
     ByGroup,
@@ -75,17 +75,7 @@ def location_numbers(location: Location) -> Numbers:
     until = None
     if location.until is not None:
         until = location.until.step
-    return {
-        "simultaneous": location.simultaneous,
-        "steps_above": location.above,
-        "steps_below": location.below,
-        "first_outside": location.first_outside,
-        "first_step": location.first_step,
-        "since": location.since,
-        "lasting": location.lasting,
-        "subset": location.subset,
-        "until": until,
-    }
+    return vars(location) | {"until": until}
 
 
 def bias_numbers(bias: Bias) -> Numbers:

@@ -271,8 +271,8 @@ class Location:
     """Beginning and place of a fault; T steps."""
 
     simultaneous: Array  # (T, 2), where the ANEES of a consistent filter lies in all steps at once
-    above: int  # steps above it
-    below: int
+    steps_above: int
+    steps_below: int
     first_outside: int | None  # first step outside, found at fault or not
     first_step: int | None = None  # the same where some step was found at fault
     since: int | None = None  # the fault begins there: it was absent before

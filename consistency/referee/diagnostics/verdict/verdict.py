@@ -36,7 +36,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.skipping import Skipped
+    from consistency.referee.diagnostics.records.skipped_start import Skipped
 
 UNKNOWN_ENDS = (float("nan"), float("nan"))
 

@@ -10,7 +10,7 @@ from consistency.referee.diagnostics.verdict.parts import Scale
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.faults import (
     bias_text,
-    innovations_text,
+    innovation_faults,
     joint_text,
     opposite,
     scale_text,
@@ -20,12 +20,15 @@ from consistency.referee.diagnostics.words.faults import (
 from consistency.referee.diagnostics.words.groups import groups_text
 from consistency.referee.diagnostics.words.numbers import SMALLEST_P, ratio_text
 
+NAMED = {"biased": BIAS, "heavy-tailed": ["outliers"], "overconfident": SCALE, "conservative": SCALE}  # by statuses
+
 
 def fault_sentence(v: Findings, s: Scale) -> str:
     """The sentence where a question found a fault."""
-    of_scale = _any_of(SCALE, v.faults)
-    of_bias = _any_of(BIAS, v.faults)
-    is_asked = _any_of(BIAS, [answer.question for answer in v.answers])
+    faults = set(v.faults)
+    of_scale = faults.intersection(SCALE)
+    of_bias = faults.intersection(BIAS)
+    is_asked = any(answer.question in BIAS for answer in v.answers)
     found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
     contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in v.faults
     if v.status == "heavy-tailed" or "outliers" in v.faults or (contrary and not opposite(v)):
@@ -36,7 +39,7 @@ def fault_sentence(v: Findings, s: Scale) -> str:
     if of_scale and v.status not in ("biased", "heavy-tailed"):
         scale = scale_text(v)
         found.append((scale, SCALE))
-    if _any_of(SHAPE, v.faults) and v.status not in ("biased", "heavy-tailed"):
+    if faults.intersection(SHAPE) and v.status not in ("biased", "heavy-tailed"):
         found.append((shape_text(v, scale), SHAPE))
     if JOINT in v.faults and v.joint is not None and v.status != "heavy-tailed":
         found.append((joint_text(v, v.joint), [JOINT]))
@@ -48,10 +51,8 @@ def fault_sentence(v: Findings, s: Scale) -> str:
         parts.append(groups_text(v.by_group, GROUP in v.faults))
     if len(v.faults) == 1:
         parts += [ALONE[question] for question in v.faults if question in ALONE]
-    if "innovation scale" in v.faults and v.innovations is not None:
-        parts.append(innovations_text(v, v.innovations))
-    if "innovation whiteness" in v.faults:
-        parts.append("innovations correlated over steps")
+    if v.innovations is not None:
+        parts += innovation_faults(v, v.innovations)
     if (of_scale or GROUP in v.faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
         parts.append("no bias found")
     return "; ".join(part for part in parts if part)
@@ -59,11 +60,6 @@ def fault_sentence(v: Findings, s: Scale) -> str:
 
 def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
     """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
-    named = {"biased": BIAS, "heavy-tailed": ["outliers"]}.get(v.status, ())
     p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
-    return questions is not named and questions != named, max(p, SMALLEST_P), [*order, questions].index(questions)
-
-
-def _any_of(questions: Collection[str], asked: Collection[str]) -> bool:
-    return any(question in asked for question in questions)
+    return questions != NAMED.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
@@ -12,6 +10,7 @@ from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovatio
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
+    SIDE,
     is_uncertain,
     off_by,
     off_by_factor,
@@ -19,13 +18,10 @@ from consistency.referee.diagnostics.words.numbers import (
     ratio_text,
     short,
 )
-from consistency.referee.diagnostics.words.unlike_factors import block_text, unlike_ratios, unlike_text
+from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 NAMED = 0.1  # part of a unit vector that a sentence names
-
-NamedRatio = tuple[str, Interval]
-
 
 # --- the scale ---------------------------------------------------------------------------------------
 
@@ -53,29 +49,26 @@ def scale_text(v: Findings) -> str:
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
-    text = _size_text(v, inflation, about)
-    blocks = ""
+    size, note = _size_and_note(v, inflation)
+    text = f"covariance{about} {size}{_since(v)}"
+    factors = ""
     if not about:
-        blocks = block_text(v)
-    if blocks:
-        return f"{text}{_first_visible(v)}: {blocks}"
-    text += _where(v) + _first_visible(v)
-    if not about and v.status == "overconfident" and AXIS in v.faults and not v.settings.one_sided:
-        text += _contrary_axis(v)
-    return text
+        factors = factors_text(v)
+    if factors:
+        return f"{text}{_first_visible(v)}{note}; {factors}"
+    return f"{text}{_where(v)}{_first_visible(v)}{note}"
 
 
-def _size_text(v: Findings, inflation: Interval, about: str) -> str:
-    """The size of the fault, and since when."""
+def _size_and_note(v: Findings, inflation: Interval) -> tuple[str, str]:
+    """The size of the fault, and what is to be known of runs that differ much."""
+    size = off_by(inflation)
     if v.runs > 1 and inflation.value > TINY and is_uncertain(inflation):
-        off = off_by_factor(inflation.value)
-        if inflation.low > 1.0:
-            off = off_by(inflation)
-        return f"covariance{about} {off}{_since(v)} in the mean, which a few {v.unit}s make"
-    text = f"covariance{about} {off_by(inflation)}"
-    if inflation.holds(1.0) and v.runs > 1:
-        return f"{text}{_since(v)}, an interval that holds 1: the {v.unit}s differ more than Gaussian errors would"
-    return f"{text}{_since(v)}"
+        if inflation.low <= 1.0:
+            size = off_by_factor(inflation.value)
+        return f"{size} in the mean", f"; a few {v.unit}s make up that mean"
+    if v.runs > 1 and inflation.holds(1.0):
+        return size, f"; the interval holds 1 because the {v.unit}s differ more than Gaussian errors would"
+    return size, ""
 
 
 def _where(v: Findings) -> str:
@@ -107,14 +100,6 @@ def _first_visible(v: Findings) -> str:
     if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
         return ""
     return f", first visible in {v.place(where.first_step)}"
-
-
-def _contrary_axis(v: Findings) -> str:
-    """The component farthest in the other direction."""
-    for axis, interval in _wrong(v, -1).items():
-        if v.axes is not None and axis in v.axes.names:
-            return f", but {off_by(interval)} in {axis}"
-    return ""
 
 
 def _since(v: Findings) -> str:
@@ -183,24 +168,17 @@ def _wrong(v: Findings, sign: int) -> dict[str, Interval]:
 def _axes_text(v: Findings) -> str:
     """The fault shows in an axis, a group or a direction alone, or in opposite axes."""
     assert v.axes is not None
-    side = SIDES.get(v.status, 0)
-    if v.settings.one_sided:
-        side = 1
-    above: list[NamedRatio] = []
-    below: list[NamedRatio] = []
-    if side != -1:
-        above = list(_wrong(v, 1).items())
-    if side != 1:
-        below = list(_wrong(v, -1).items())
+    off: dict[str, Interval] = {}
+    if v.status != "conservative":
+        off |= _wrong(v, 1)
+    if not v.settings.one_sided:
+        off |= _wrong(v, -1)
     largest = v.axes.largest
-    if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for _, i in above):
+    if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in off.values()):
         return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
-    named = (above + below)[:MOST]
-    if above and below:
-        named = [*above[: MOST - 1], below[0]]
-    if not named:
+    if not off:
         return "covariance wrong in an axis"
-    return f"covariance {_sizes_in_axes(named)}{_since(v)}"
+    return f"covariance {_sizes_in_axes(off)}{_since(v)}"
 
 
 def _direction_text(v: Findings) -> str:
@@ -212,14 +190,14 @@ def _direction_text(v: Findings) -> str:
     return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED)
 
 
-def _sizes_in_axes(named: Iterable[NamedRatio]) -> str:
-    return ", ".join(f"{off_by(interval)} in {axis}" for axis, interval in named)
+def _sizes_in_axes(off: dict[str, Interval]) -> str:
+    return ", ".join(f"{off_by(off[axis])} in {axis}" for axis in names_to_say(off))
 
 
 def _correlation_text(v: Findings) -> str:
     """Axes that are too large, and a direction in which the correlation makes the covariance too small."""
     assert v.scale is not None
-    text = f"covariance {_sizes_in_axes(list(_wrong(v, -1).items())[:MOST])}"
+    text = f"covariance {_sizes_in_axes(_wrong(v, -1))}"
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
@@ -265,6 +243,7 @@ def shape_text(v: Findings, scale: str = "") -> str:
     assert v.shape is not None
     assert v.axes is not None
     shape = v.shape
+    wrong = "covariance of the wrong shape"
     where = ""
     worth_a_word = VISIBLE
     if "shape" not in v.faults:
@@ -273,41 +252,50 @@ def shape_text(v: Findings, scale: str = "") -> str:
     gap = abs(shape.actual - shape.stated)
     if shape.shown and shape.pair is not None and (gap > worth_a_word or shape.wrong_sign):
         a, b = (v.axes.names[i] for i in shape.pair)
-        what = "covariance of the wrong shape: correlation"
+        what = f"{wrong}: correlation"
         if shape.wrong_sign:
             what = "correlation of the wrong sign:"
         text = f"{what} {shape.actual:+.2f}, stated {shape.stated:+.2f}, of {a} and {b}{where}"
         if shape.alone:
             text += "; no axis by itself is wrong"
         return text
-    if shape.alone:
-        return f"covariance of the wrong shape{where}; no axis by itself is wrong"
     off = list(unlike_ratios(v).values())[:MOST]
     if not off:
-        return f"covariance of the wrong shape{where}"
-    if all(off_by(ratio) in scale for ratio in off):
+        return f"{wrong}{where}"
+    if all(off_by(ratio)[SIDE:] in scale for ratio in off):
         return ""
-    return f"unlike factors: {unlike_text(v)}"
+    return f"{wrong}: {unlike_text(v)}"
 
 
 def tails_text(v: Findings) -> str:
     """The error that stands out, or that runs differ more than they should."""
     if "outliers" not in v.faults:
-        return f"heavy tails: the {v.unit}s differ more than Gaussian errors would"
+        return f"the {v.unit}s differ more than Gaussian errors would"
     assert v.tails is not None
     where = v.run_name(v.tails.run)
     if v.steps > 1:
         where += f", {v.place(v.tails.step)}"
-    return f"heavy tails: {short(v.tails.distance)} sigma from the other {v.unit}s in {where}"
+    return f"outlier in {where}: {short(v.tails.distance)} sigma from the other {v.unit}s"
 
 
-def innovations_text(v: Findings, i: Innovations, they: str = "innovations") -> str:
+def innovation_faults(v: Findings, i: Innovations) -> list[str]:
+    """The faults that were found in the innovations."""
+    texts = []
+    if "innovation scale" in v.faults:
+        texts.append(_innovation_scale(v, i))
+    if "innovation whiteness" in v.faults:
+        texts.append("innovations correlated over steps")
+    return texts
+
+
+def _innovation_scale(v: Findings, i: Innovations) -> str:
     """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
     far = i.outliers
     if far is None:
+        size = "smaller"
         if i.ratio > 1:
-            return f"{they} larger than stated"
-        return f"{they} smaller than stated"
+            size = "larger"
+        return f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})"
     are = "are outliers, the largest"
     if far.count == 1:
         are = "is an outlier,"

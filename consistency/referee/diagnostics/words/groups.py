@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.groups import range_name
+from consistency.referee.diagnostics.records.groups_by_column import range_name
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import MOST, is_or_are, off_by, p_text, plural, ratio_text
@@ -38,7 +38,10 @@ def _faults(by: ByGroup) -> str:
     if len(others) == 1:
         text += f", and {off_by(others[0].ratio)} where {others[0].name}"
     elif others:
-        text += f", and wrong in {len(others)} of the {len(by.groups) - 1} other groups by {by.column}"
+        which = f"{len(others)} of the {len(by.groups) - 1} other groups"
+        if len(others) == len(by.groups) - 1:
+            which = f"all {len(others)} other groups"
+        text += f", and wrong in {which} by {by.column}"
     right = _consistent(by)
     if right:
         text += f"; consistent where {right}"

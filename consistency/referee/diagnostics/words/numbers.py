@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
+SIDE = len("too small")  # or "too large", with which :func:`off_by` begins
 MOST = 3  # axes, blocks, groups or parts that a sentence names
 SMALLEST_P = 1e-6  # below, digits of a p value say nothing
 

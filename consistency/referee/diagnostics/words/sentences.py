@@ -9,10 +9,18 @@ import numpy as np
 from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.accuracy import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
-from consistency.referee.diagnostics.verdict.parts import ByGroup, Equivalence, Innovations, Location, Scale, Within
-from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, Verdict
+from consistency.referee.diagnostics.verdict.parts import (
+    ByGroup,
+    Equivalence,
+    Innovations,
+    Interval,
+    Location,
+    Scale,
+    Within,
+)
+from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
     is_or_are,
@@ -161,7 +169,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     shown = s.equivalence
     runs = plural(v.runs, v.unit)
     none = "no fault found"
-    size = f"covariance ratio {_ratio_of_test(s)}"
+    size = f"covariance ratio {_ratio_of_test(s.inflation, shown)}"
     axis = ""
     if v.status == "failed":
         none = "no other fault found"
@@ -184,22 +192,21 @@ def _no_fault(v: Findings, s: Scale) -> str:
     return f"{none}, but {runs} {do} not show the {size} to be {_between(shown)}{axis}{_advice(v, shown)}"
 
 
-def _ratio_of_test(s: Scale) -> str:
+def _ratio_of_test(ratio: Interval, shown: Equivalence) -> str:
     """The ratio, with the interval of the two tests that show where it is."""
-    shown = s.equivalence
     if shown.interval is None:
-        return ratio_text(s.inflation)
+        return ratio_text(ratio)
     low, high = shown.interval
     if np.isinf(high):
-        return f"{short(s.inflation.value)} (known to be above {short(low)} only)"
+        return f"{short(ratio.value)} (known to be above {short(low)} only)"
     if shown.one_sided:
-        return f"{short(s.inflation.value)} (below {short(high)} at a confidence of {percent(1.0 - shown.level)})"
-    return f"{short(s.inflation.value)} ({percent(1.0 - 2.0 * shown.level)} interval {short(low)} to {short(high)})"
+        return f"{short(ratio.value)} (below {short(high)} at a confidence of {percent(1.0 - shown.level)})"
+    return f"{short(ratio.value)} ({percent(1.0 - 2.0 * shown.level)} interval {short(low)} to {short(high)})"
 
 
 def _advice(v: Findings, shown: Equivalence) -> str:
-    """The number of runs that would probably decide."""
-    if shown.runs is None or shown.runs > MUCH:
+    """The number of runs that would probably decide; '' where runs failed, which no further run mends."""
+    if v.status == "failed" or shown.runs is None or shown.runs > MUCH:
         return ""
     needed = max(shown.runs, v.runs + 1)
     if v.lost is not None and v.settings.lost is not None and v.lost.needed is not None:
@@ -258,10 +265,10 @@ def _level(v: Findings, s: Scale, location: Location) -> str:
         text += f"; {short(s.median_run)} in the median and {short(s.worst_run)} in the worst {v.unit}"
     if s.judged_steps > 1:
         where = []
-        if location.above:
-            where.append(f"{location.above} above")
-        if location.below:
-            where.append(f"{location.below} below")
+        if location.steps_above:
+            where.append(f"{location.steps_above} above")
+        if location.steps_below:
+            where.append(f"{location.steps_below} below")
         outside = " and ".join(where) or "none"
         text += f"; {v.places} outside the simultaneous band: {outside} of {s.judged_steps}"
     return text
@@ -397,22 +404,21 @@ def _without_truth(v: Findings, i: Innovations) -> str:
             "no truth, and innovations decide nothing unless the filter declares an optimal gain: those of any other "
             "filter are neither white nor of the stated size even if it is right"
         )
-    parts = ["no truth: judged by the innovations alone, which cannot see most pose errors"]
-    if "innovation scale" in v.faults:
-        from consistency.referee.diagnostics.words.faults import innovations_text
-
-        parts.append(innovations_text(v, i, "they are"))
-    if "innovation whiteness" in v.faults:
-        parts.append("they are correlated over steps")
+    parts = []
     shown = i.equivalence
-    if not v.faults and shown is not None:
-        is_shown = "is not shown to be"
+    if v.faults:
+        from consistency.referee.diagnostics.words.faults import innovation_faults
+
+        parts += innovation_faults(v, i)
+    elif shown is not None:
+        is_shown = "but their NIS per degree of freedom {} is not shown to be"
         if shown.shown:
-            is_shown = "is shown to be"
-        parts.append(f"their NIS {is_shown} {_between(shown)} times its degrees of freedom")
+            is_shown = "and their NIS per degree of freedom {} is shown to be"
+        ratio = _ratio_of_test(Interval(i.ratio, *UNKNOWN_ENDS), shown)
+        parts.append(f"no fault found in the innovations, {is_shown.format(ratio)} {_between(shown)}")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
-    return "; ".join(parts)
+    return "; ".join([*parts, "without truth most pose errors cannot be seen"])
 
 
 def _nis(i: Innovations) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.parts import TINY, ComponentRatios, Interval
 from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import MOST, names_in_a_row, off_by
+from consistency.referee.diagnostics.words.numbers import MOST, SIDE, names_in_a_row, off_by
 
 BLOCKS = ("position", "attitude", "velocity")
 
@@ -38,14 +38,17 @@ def are_alike(intervals: list[Interval]) -> bool:
 def unlike_ratios(v: Findings) -> dict[str, Interval]:
     """Blocks and axes whose ratio is not 1, the farthest first; none where all may be off by one factor.
 
-    Of a conservative covariance those that are too large alone: nothing in it has to grow.
+    Of a conservative covariance those that are too large alone, as nothing in it has to grow. Where that is not a
+    fault, those that are too small.
     """
     if v.axes is None:
         return {}
     ratios = ratios_of_blocks(v.axes)
     if are_alike(list(ratios.values())):
         return {}
-    off = [(name, ratio) for name, ratio in ratios.items() if ratio.high < 1.0]
+    off = []
+    if not v.settings.one_sided:
+        off = [(name, ratio) for name, ratio in ratios.items() if ratio.high < 1.0]
     if v.status != "conservative":
         off += [(name, ratio) for name, ratio in ratios.items() if ratio.low > 1.0]
     return dict(sorted(off, key=lambda item: -abs(np.log(max(item[1].value, TINY)))))
@@ -57,7 +60,12 @@ def unlike_text(v: Findings) -> str:
     if not off:
         return ""
     assert v.axes is not None
-    texts = [f"{name} {off_by(ratio)}" for name, ratio in list(off.items())[:MOST]]
+    texts = []
+    side = ""
+    for name in names_to_say(off):
+        size = off_by(off[name])
+        texts.append(f"{name} {size.removeprefix(side).lstrip()}")  # the side once: x too small by ..., y by ...
+        side = size[:SIDE]
     others = {name: ratio for name, ratio in ratios_of_blocks(v.axes).items() if name not in off}
     factor = v.settings.factor
     right = [name for name, ratio in others.items() if 1.0 / factor <= ratio.low and ratio.high <= factor]
@@ -68,13 +76,23 @@ def unlike_text(v: Findings) -> str:
     return ", ".join(texts)
 
 
-def block_text(v: Findings) -> str:
-    """:func:`unlike_text` where whole blocks carry the fault of the scale; '' where single axes do, or all."""
+def names_to_say(off: dict[str, Interval]) -> list[str]:
+    """The first of those that are off, with one of either side."""
+    names = list(off)[:MOST]
+    contrary = [name for name in off if (off[name].value > 1.0) != (off[names[0]].value > 1.0)]
+    if contrary and contrary[0] not in names:
+        names[-1] = contrary[0]
+    return names
+
+
+def factors_text(v: Findings) -> str:
+    """:func:`unlike_text` where the axes that carry the fault of the scale are among those that it names, or ''."""
     assert v.location is not None
     if v.axes is None:
         return ""
-    blocks = [name for name in unlike_ratios(v) if members_of(v.axes, name)]
-    inside = {axis for block in blocks for axis in members_of(v.axes, block)}
-    if not blocks or (v.location.subset and not inside.issuperset(v.location.subset.split(", "))):
+    inside = set()
+    for name in unlike_ratios(v):
+        inside.update(members_of(v.axes, name) or [name])
+    if not inside.issuperset(v.location.subset.split(", ") if v.location.subset else ()):
         return ""
     return unlike_text(v)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.geometry.groups import adjoint, inverse, matrices, propagated, to_left, vectors
+from consistency.referee.geometry.lie_groups import adjoint, inverse, matrices, propagated, to_left, vectors
 from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows
 from consistency.referee.types import Array
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import on_steps
+from consistency.referee.diagnostics.records.groups_by_column import on_steps
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading, require_name, require_room

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL
-from consistency.referee.geometry.groups import state_error
+from consistency.referee.geometry.lie_groups import state_error
 from consistency.referee.readers.formats.rotations import are_rotations, quaternions
 from consistency.referee.types import Array
 
@@ -34,7 +34,7 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
         the parts as they stand in the covariance, R, p, v, bg, ba by default; one run may lack the first dimension
     convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1), ``additive`` a difference;
         ``so3`` and ``so3-body`` are additive but for the rotation
-        (:func:`consistency.referee.geometry.groups.state_error`). Biases are differences.
+        (:func:`consistency.referee.geometry.lie_groups.state_error`). Biases are differences.
 
     Raises
     ------

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import inverse, vectors
+from consistency.referee.geometry.lie_groups import inverse, vectors
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
 from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.rotations import are_rotations

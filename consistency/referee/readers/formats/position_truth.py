@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.groups import matrices, propagated, to_left
+from consistency.referee.geometry.lie_groups import matrices, propagated, to_left
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines

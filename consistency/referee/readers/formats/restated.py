@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +32,7 @@ from consistency.referee.readers.truth_matching import STATE
 
 Factors = Mapping[str, tuple[float, float]]  # factor and floor of a component by name
 Change = Callable[[int, str], Factors | None]  # by run and value of --by; None leaves a line out
+QUOTED = r'(?=(?:[^"]*"[^"]*")*[^"]*$)'  # a place with an even number of quotes after it
 
 
 @dataclass(frozen=True)
@@ -61,41 +60,42 @@ class TextFile:
         return "".join(text)
 
     def _line(self, line: str, change: Change) -> str:
-        """A line with its covariance restated; "" where its run or estimator is left out."""
-        if not line.strip() or line.lstrip().startswith("#"):
-            return line
-        separator = max(",;\t", key=line.count)
+        """A line with its covariance restated, and no other change; "" where its run or estimator is left out."""
         text = line.rstrip("\r\n")
-        end = line[len(text) :]
-        if separator not in line:  # white space, which stays as it is
-            parts = re.split(r"(\s+)", text.strip())
-            fields = self._fields(parts[::2], change)
-            parts[::2] = fields or parts[::2]
-            restated = "".join(parts)
-        else:
-            fields = self._fields(next(csv.reader([text], delimiter=separator, skipinitialspace=True)), change)
-            out = io.StringIO()
-            csv.writer(out, delimiter=separator, lineterminator="").writerow(fields)
-            restated = out.getvalue()
-        return restated + end if fields else ""
+        separator = max(",;\t", key=text.count)
+        between = re.escape(separator)
+        if separator not in text:
+            text = text.strip()
+            between = r"\s+"
+        if not text.strip() or text.lstrip().startswith("#"):
+            return line
+        if '"' in text:  # a separator between quotes is none
+            between += QUOTED
+        parts = re.split(f"({between})", text)
+        restated = self._fields(parts[::2], change)
+        if not restated:
+            return ""
+        parts[::2] = restated
+        return line.replace(text, "".join(parts), 1)
 
     def _fields(self, fields: list[str], change: Change) -> list[str]:
         """Fields of a line with its covariance restated; none where its run or estimator is left out."""
-        if self.filter_column is not None and fields[self.filter_column].strip() != self.filter:
+        bare = [field.strip(' "') for field in fields]
+        if self.filter_column is not None and bare[self.filter_column] != self.filter:
             return []
         run = self.run
         value = ""
         if self.run_column is not None:
-            run = int(float(fields[self.run_column]))
+            run = int(float(bare[self.run_column]))
         if self.by_column is not None:
-            value = fields[self.by_column]
+            value = bare[self.by_column]
         factors = change(run, value)
         if factors is None:
             return []
         restated = list(fields)
         for column, (a, b) in self.entries.items():
-            if fields[column].strip():
-                restated[column] = repr(self._number(float(fields[column]), a, b, factors))
+            if bare[column]:
+                restated[column] = repr(self._number(float(bare[column]), a, b, factors))
         return restated
 
     def _number(self, value: float, a: str, b: str, factors: Factors) -> float:

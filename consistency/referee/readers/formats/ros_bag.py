@@ -14,7 +14,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.groups import inverse, matrices, vectors
+from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes

@@ -84,8 +84,11 @@ def _both(
             truth = columns.with_clock(truth)
     if truth is None:
         truth = columns.true_columns(sheet, axes)
+        missing = columns.missing_truth(sheet, axes)
         if truth is not None:
             notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
+        elif missing:
+            notes.append(f"{sheet.path}: only the NIS is read, because the truth cannot be used: {missing}")
     return sheet, truth, [note for note in notes if note]
 
 
@@ -157,7 +160,9 @@ def _require_truth(
         state = ""
         if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
-        columns.require_true_columns(sheet, axes)
+        missing = columns.missing_truth(sheet, axes)
+        if missing:
+            raise InputError(f"{sheet.path}: {missing}")
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")

@@ -66,15 +66,16 @@ def true_columns(sheet: TableRows, axes: Sequence[str]) -> TableRows | None:
     return replace(sheet, data=data).rows(complete)
 
 
-def require_true_columns(sheet: TableRows, axes: Sequence[str]) -> None:
-    """Refuse a table in which the truth of only some components stands beside the estimates."""
+def missing_truth(sheet: TableRows, axes: Sequence[str]) -> str:
+    """What a table lacks in which the truth of only some components stands beside the estimates; "" of others."""
     places = state_columns(list(sheet.data), axes, TRUE)
     missing = [axis for axis in axes if axis not in places]
-    if places and missing:
-        raise InputError(
-            f"{sheet.path}: column 'true_{missing[0]}' is missing; there are: {sheet.columns}; the state is "
-            f"{','.join(axes)}: --state names another, and --columns true_{missing[0]}=NAME that column"
-        )
+    if not places or not missing:
+        return ""
+    return (
+        f"column 'true_{missing[0]}' is missing; there are: {sheet.columns}; the state is {','.join(axes)}: --state "
+        f"names another, and --columns true_{missing[0]}=NAME that column"
+    )
 
 
 def require_columns(sheet: TableRows, axes: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.geometry.groups import inverse, matrices, vectors
+from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
 from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 

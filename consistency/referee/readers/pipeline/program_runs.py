@@ -124,9 +124,11 @@ class ProgramStudy:
 
     @property
     def name(self) -> str:
-        """Name of an estimator that is called after its file."""
+        """What the estimator is called that has no name in its table: the program, or the file in folders of before."""
         stem = Path(self.estimates).stem
-        return "estimates" if "{" in stem else stem
+        if "{" in stem:
+            stem = "estimates"
+        return str(self.manifest.get("program") or stem)
 
     @property
     def settings(self) -> Settings:

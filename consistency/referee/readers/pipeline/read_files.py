@@ -37,6 +37,7 @@ from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
+IN_COLUMNS = ("so2", "so3", "so3-body", "vector", "additive")  # errors of positions and velocities are in the world
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": ", whose covariance is of a declared error too",
@@ -316,8 +317,26 @@ def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
         e = in_axes_of_estimates(e, r)
     records = []
     for record in records_of(e, r):
-        records.append(replace(with_failed_runs(record, e.failed), trials=e.trials))
+        own = own_names(record, r)
+        records.append(replace(with_failed_runs(record, e.failed), trials=e.trials, own_names=own))
     return records
+
+
+def own_names(record: Record, r: Reading) -> dict[str, str]:
+    """What the columns of ``--columns`` are called whose errors are those of components, by component.
+
+    There are none where the error is not a difference of columns: in the body, of motions, or after an alignment.
+    """
+    if record.convention not in IN_COLUMNS or record.window is not None or r.align is not None:
+        return {}
+    names = {}
+    for new, old in (r.columns or {}).items():
+        before, _, after = new.partition("*")
+        for axis in record.axes:
+            rest = axis[len(before) : len(axis) - len(after)]
+            if new.replace("*", rest) == axis:
+                names[axis] = old.replace("*", rest)
+    return names
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:

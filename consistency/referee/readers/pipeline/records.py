@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record, each_alone
-from consistency.referee.diagnostics.records.validity import ROUNDED, Validity, classify
+from consistency.referee.diagnostics.records.valid_covariances import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible

@@ -5,9 +5,8 @@ Rectification makes their images ones without distortion whose rows correspond: 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,76 +14,63 @@ from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
-from consistency.stereo.visual_odometry.cameras.yaml_file import read_matrix
 
 WIDEST = 30.0  # m between two cameras on one rig; calibrations are often in millimetres by mistake
-EUROC_BODY, CAMERA_0 = "body of EuRoC", "camera 0 of KITTI raw"
-COUNTS = (4, 5, 8, 12, 14)  # distortion coefficients that OpenCV knows
+EUROC_BODY = "body of EuRoC"
+CAMERA_0 = "camera 0 of KITTI raw"
 
 
 @dataclass(frozen=True)
 class PairCalibration:
-    """Two cameras as calibrated, before any rectification."""
+    """Two cameras as calibrated, before any rectification.
+
+    Raises
+    ------
+    InputError
+        The numbers cannot be those of two cameras side by side.
+    """
 
     source: str  # file or files, for messages
     K_left: Array  # (3, 3), px
     K_right: Array  # (3, 3), px
     D_left: Array  # (k,), k1 k2 p1 p2 ... of OpenCV, all 0 for images without distortion
     D_right: Array
-    R: Array  # (3, 3), x_right = R x_left + T (Bouguet's convention, OpenCV's)
+    R: Array  # (3, 3), x_right = R x_left + T (Bouguet's convention, OpenCV's); replaced by the nearest rotation
     T: Array  # (3,), m
     image_size: tuple[int, int] | None  # width, height, px; None where the file does not say
     body_from_left: Array | None = None  # (4, 4), pose of the left camera in the body that a truth is of
     body: str = ""  # which body that is: that of EuRoC, or camera 0 of KITTI raw
 
+    def __post_init__(self) -> None:
+        self._require_camera("left", self.K_left)
+        self._require_camera("right", self.K_right)
+        U, singular, Vt = np.linalg.svd(self.R)
+        if not np.allclose(singular, 1.0, atol=1e-3) or np.linalg.det(self.R) < 0:  # files print six digits or more
+            raise InputError(
+                f"{self.source}: the rotation between the cameras is not one (singular values {singular.round(4)})"
+            )
+        object.__setattr__(self, "R", U @ Vt)
+        centre = -self.R.T @ self.T
+        if centre[0] <= 0 or abs(centre[1]) > centre[0]:
+            raise InputError(
+                f"{self.source}: the right camera stands at {np.round(centre, 3).tolist()} m of the left one, not to "
+                "its right: T is that of x_right = R x_left + T, in metres; are the cameras swapped?"
+            )
+        if centre[0] > WIDEST:
+            raise InputError(
+                f"{self.source}: the right camera stands {centre[0]:g} m from the left one; T is in metres, is it in "
+                "millimetres?"
+            )
 
-def checked_calibration(calibration: PairCalibration) -> PairCalibration:
-    """The calibration, if its numbers can be those of two cameras side by side."""
-    where = calibration.source
-    for name, K in (("left", calibration.K_left), ("right", calibration.K_right)):
+    def _require_camera(self, side: str, K: Array) -> None:
         upper = np.allclose(K[1:, 0], 0) and np.isclose(K[2, 1], 0) and np.isclose(K[2, 2], 1)
         if not upper or K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError(
-                f"{where}: the matrix of the {name} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0"
+                f"{self.source}: the matrix of the {side} camera must be fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0"
             )
-    calibration = replace(calibration, R=nearest_rotation(where, calibration.R))
-    centre = -calibration.R.T @ calibration.T
-    if centre[0] <= 0 or abs(centre[1]) > centre[0]:
-        raise InputError(
-            f"{where}: the right camera stands at {np.round(centre, 3).tolist()} m of the left one, not to its right: "
-            "T is that of x_right = R x_left + T, in metres; are the cameras swapped?"
-        )
-    if centre[0] > WIDEST:
-        raise InputError(
-            f"{where}: the right camera stands {centre[0]:g} m from the left one; T is in metres, is it in millimetres?"
-        )
-    return calibration
 
 
-def nearest_rotation(where: str, R: Array) -> Array:
-    """The rotation nearest to ``R``; calibrations print six digits or more."""
-    U, singular, Vt = np.linalg.svd(R)
-    if not np.allclose(singular, 1.0, atol=1e-3) or np.linalg.det(R) < 0:
-        raise InputError(f"{where}: the rotation between the cameras is not one (singular values {singular.round(4)})")
-    return np.asarray(U @ Vt)
-
-
-def distortion(path: Path, key: str, values: Array) -> Array:
-    values = values.ravel()
-    if values.size not in COUNTS:
-        raise InputError(f"{path}: key '{key}': has {values.size} coefficients, not {', '.join(map(str, COUNTS))}")
-    return values
-
-
-def sized(path: Path, key: str, value: Any, count: int) -> Array:
-    numbers = read_matrix(path, key, value).ravel()
-    if numbers.size != count:
-        raise InputError(f"{path}: key '{key}': has {numbers.size} numbers, not {count}")
-    return numbers
-
-
-@dataclass(frozen=True)
-class Rectification:
+class Rectification(NamedTuple):
     """The rig of the rectified images, and how raw images become rectified."""
 
     rig: StereoRig
@@ -96,10 +82,10 @@ class Rectification:
         if self.maps is None:
             return left, right
         cv2 = opencv()
-        one, two = (
-            cv2.remap(image, *maps, cv2.INTER_LINEAR) for image, maps in zip((left, right), self.maps, strict=True)
-        )
-        return one, two
+        left_maps, right_maps = self.maps
+        left = cv2.remap(left, *left_maps, cv2.INTER_LINEAR)
+        right = cv2.remap(right, *right_maps, cv2.INTER_LINEAR)
+        return left, right
 
 
 def rectify(calibration: PairCalibration, image_size: tuple[int, int]) -> Rectification:
@@ -119,8 +105,7 @@ def rectify(calibration: PairCalibration, image_size: tuple[int, int]) -> Rectif
     """
     c = calibration
     if c.image_size is not None and c.image_size != image_size:
-        stated, found = (f"{width} x {height} px" for width, height in (c.image_size, image_size))
-        raise InputError(f"{c.source}: is for images of {stated}, but the images have {found}")
+        raise InputError(f"{c.source}: is for images of {in_px(c.image_size)}, but the images have {in_px(image_size)}")
     raw = StereoRig(c.K_left, c.K_right, c.R.T, -c.R.T @ c.T, image_size)
     if not c.D_left.any() and not c.D_right.any() and is_rectified(raw):
         return Rectification(raw, np.eye(3), None)
@@ -135,14 +120,15 @@ def rectify(calibration: PairCalibration, image_size: tuple[int, int]) -> Rectif
         c.T.reshape(3, 1),
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=0.0,
-    )  # fmt: skip
-    maps = [
-        cv2.initUndistortRectifyMap(K, D, turn, P, image_size, cv2.CV_16SC2)
-        for K, D, turn, P in (
-            (c.K_left, c.D_left, turn_left, P_left),
-            (c.K_right, c.D_right, turn_right, P_right),
-        )
-    ]
+    )
+    left = cv2.initUndistortRectifyMap(c.K_left, c.D_left, turn_left, P_left, image_size, cv2.CV_16SC2)
+    right = cv2.initUndistortRectifyMap(c.K_right, c.D_right, turn_right, P_right, image_size, cv2.CV_16SC2)
     baseline = np.array([-P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
     rig = StereoRig(P_left[:, :3], P_right[:, :3], np.eye(3), baseline, image_size)
-    return Rectification(rig, np.asarray(turn_left), (tuple(maps[0]), tuple(maps[1])))
+    return Rectification(rig, turn_left, (left, right))
+
+
+def in_px(size: tuple[int, ...]) -> str:
+    """The size of an image in words."""
+    width, height = size
+    return f"{width} x {height} px"

@@ -17,7 +17,6 @@ FARTHEST = 1e6  # depth in baselines from which on a point is at infinity
 # What A'A leaves of a coordinate's own entry when the others are eliminated: some 3e-13 at FARTHEST, up to 6e-16 by
 # rounding alone. Parallel rays must not pass for a point that rounding made up.
 FIXED = 2e-14
-BLOCK = 2000  # matches triangulated at a time, whose matrices fit the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +62,23 @@ class StereoRig:
         """Distance of the two cameras, m."""
         return float(np.linalg.norm(self.t))
 
+    @property
+    def f(self) -> float:
+        """Focal length of the left camera along its rows, px."""
+        return float(self.K_left[0, 0])
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """That of the left camera, px."""
+        u, v = self.K_left[:2, 2].tolist()
+        return u, v
+
     @cached_property
     def cameras(self) -> Array:
         """(2, 3, 4): K [I 0] of eq. 2.1 and K' [R' -R't], which eq. 2.2 calls [R t]."""
         left = np.column_stack([self.K_left, np.zeros(3)])
-        return np.stack([left, self.K_right @ np.column_stack([self.R.T, -self.R.T @ self.t])])
+        right = np.column_stack([self.R.T, -self.R.T @ self.t])
+        return np.stack([left, self.K_right @ right])
 
     def project(self, points: Array) -> Array:
         """Eq. 2.1 and 2.2: points in the left camera's frame to both images.
@@ -88,14 +99,17 @@ class StereoRig:
         p = arrays.checked_rows("points", points, 3)
         h = p @ np.swapaxes(self.cameras[:, :, :3], 1, 2) + self.cameras[:, None, :, 3]  # (2, N, 3)
         depth = h[:, :, 2]
-        if (bad := (depth <= NEAREST * self.baseline).any(axis=0)).any():
-            k = int(np.argmax(bad))
+        bad = np.flatnonzero((depth <= NEAREST * self.baseline).any(axis=0))
+        if len(bad):
+            k = int(bad[0])
             raise PointError(f"points: number {k} is at or behind a camera; leave such points out", k)
-        return np.concatenate(list(h[:, :, :2] / depth[:, :, None]), axis=1)
+        left, right = h[:, :, :2] / depth[:, :, None]
+        return np.column_stack([left, right])
 
     def inside(self, uv: Array) -> Array:
         """(N, 4) px to (N,) bool: seen in both images."""
-        return np.asarray(((uv >= 0.0) & (uv <= np.tile(self.image_size, 2) - 1.0)).all(axis=1))
+        largest = np.tile(self.image_size, 2) - 1.0
+        return np.asarray(((uv >= 0.0) & (uv <= largest)).all(axis=1))
 
 
 def triangulate(rig: StereoRig, uv: Array) -> Array:
@@ -138,36 +152,34 @@ def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
 
 def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
     """Points (N, 3), and which of them are in front of both cameras (N,)."""
-    if len(uv) <= BLOCK:
-        return _in_front(rig, *_system(rig, uv))
-    points, good = zip(*(_points(rig, uv[i : i + BLOCK]) for i in range(0, len(uv), BLOCK)), strict=True)
-    return np.concatenate(points), np.concatenate(good)
+    A, b = _system(rig, uv)
+    AtA = np.einsum("kin,kjn->ijn", A, A)
+    inverse, definite = arrays.symmetric_inverses(np.moveaxis(AtA, -1, 0))
+    inverse = np.moveaxis(inverse, 0, -1)
+    alone = np.einsum("iin,iin->in", inverse, AtA)
+    fixed = definite & (alone < 1.0 / FIXED).all(axis=0)
+    points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
+    depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
+    far_enough = (depth > NEAREST * rig.baseline).all(axis=0)
+    near_enough = (depth < FARTHEST * rig.baseline).all(axis=0)
+    return np.ascontiguousarray(points.T), fixed & far_enough & near_enough
 
 
 def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
     """A (4, 3, N) and b (4, N): the points last, so that sums run along memory."""
-    P = rig.cameras
-    rows, last = P[:, :2].reshape(4, 4, 1), P[:, 2].repeat(2, axis=0)[:, :, None]
+    rows = rig.cameras[:, :2].reshape(4, 4, 1)
+    last = rig.cameras[:, 2].repeat(2, axis=0)[:, :, None]
     A = uv.T[:, None] * last[:, :3]
     A -= rows[:, :3]
     return A, rows[:, 3] - uv.T * last[:, 3]
 
 
-def _in_front(rig: StereoRig, A: Array, b: Array) -> tuple[Array, Array]:
-    AtA = np.einsum("kin,kjn->ijn", A, A)
-    inverse, definite = arrays.symmetric_inverses(np.moveaxis(AtA, -1, 0))
-    inverse = np.moveaxis(inverse, 0, -1)
-    alone = np.einsum("iin,iin->in", inverse, AtA)
-    definite &= (alone < 1.0 / FIXED).all(axis=0)
-    points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
-    depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
-    near, far = NEAREST * rig.baseline, FARTHEST * rig.baseline
-    return np.ascontiguousarray(points.T), definite & ((depth > near) & (depth < far)).all(axis=0)
-
-
 def is_rectified(rig: StereoRig) -> bool:
     """Whether rows of both images correspond: same axes and focal lengths, baseline along x within 1 %."""
-    same = np.allclose(rig.R, np.eye(3), atol=1e-6)
-    focal = np.allclose(np.delete(rig.K_left, 2, axis=1), np.delete(rig.K_right, 2, axis=1), rtol=1e-6)
-    rows = abs(rig.K_left[1, 2] - rig.K_right[1, 2]) < 1e-3
-    return bool(same and focal and rows and np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])
+    if not np.allclose(rig.R, np.eye(3), atol=1e-6):
+        return False
+    if not np.allclose(rig.K_left[:, :2], rig.K_right[:, :2], rtol=1e-6):
+        return False
+    if abs(rig.K_left[1, 2] - rig.K_right[1, 2]) >= 1e-3:
+        return False
+    return bool(np.linalg.norm(rig.t[1:]) <= 0.01 * rig.t[0])

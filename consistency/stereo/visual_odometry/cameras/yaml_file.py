@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,61 @@ SIGNATURE = "%YAML"  # how a file of FileStorage begins: %YAML:1.0 up to OpenCV 
 MATRIX = {"rows", "cols", "dt", "data"}  # keys of a matrix in it
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The keys of a YAML file, by OpenCV where FileStorage has written it.
+@dataclass(frozen=True)
+class YamlKeys:
+    """Keys of a YAML file, or of a table in it; errors name file and key.
 
     Values are numbers, text, lists, tables and, of FileStorage, arrays.
+    """
+
+    path: Path
+    values: dict[str, Any]
+    outer: str = ""  # names of the tables around these keys, each with a point behind it
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def table(self, key: str) -> YamlKeys:
+        """The keys below a key."""
+        value = self.values.get(key)
+        if not isinstance(value, dict):
+            raise InputError(f"{self.path}: key '{self.outer}{key}' is missing, or holds no keys of its own")
+        return YamlKeys(self.path, value, f"{self.outer}{key}.")
+
+    def matrix(self, key: str) -> Array:
+        """Numbers of a key: a number, a list, an array, or a table with rows, cols and data."""
+        value = self.values.get(key)
+        where = f"{self.path}: key '{self.outer}{key}'"
+        try:
+            if isinstance(value, dict):
+                shape = int(value["rows"]), int(value["cols"])
+                numbers = _floats(value["data"]).reshape(shape)
+            else:
+                numbers = _floats(value)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise InputError(f"{where}: must be numbers, or a matrix with rows, cols and data") from None
+        if not (np.abs(numbers) < HUGE).all():
+            raise InputError(f"{where}: holds a number that is not finite")
+        return numbers
+
+    def numbers(self, key: str, count: int) -> Array:
+        """The ``count`` numbers of a key, (count,)."""
+        numbers = self.matrix(key).ravel()
+        if numbers.size != count:
+            raise InputError(f"{self.path}: key '{self.outer}{key}': has {numbers.size} numbers, not {count}")
+        return numbers
+
+    def number(self, key: str) -> float:
+        """The only number of a key."""
+        return float(self.numbers(key, 1)[0])
+
+
+def _floats(value: Any) -> Array:
+    return np.asarray(value, dtype=object).ravel().astype(float)
+
+
+def read_yaml(path: Path) -> YamlKeys:
+    """The keys of a YAML file, by OpenCV where FileStorage has written it.
 
     Raises
     ------
@@ -36,10 +88,13 @@ def read_yaml(path: Path) -> dict[str, Any]:
     text = read_text(path, UNREADABLE, LARGEST)
     with reading(path, UNREADABLE):
         _require_shallow(text)
-    data = _stored(path, text) if text.startswith(SIGNATURE) else _plain(path, text)
+    parse = _plain
+    if text.startswith(SIGNATURE):
+        parse = _stored
+    data = parse(path, text)
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no 'key: value' lines")
-    return {str(key): value for key, value in data.items()}
+    return YamlKeys(path, {str(key): value for key, value in data.items()})
 
 
 def _require_shallow(text: str) -> None:
@@ -97,20 +152,6 @@ def _value(cv2: Any, node: Any) -> Any:
         return [_value(cv2, node.at(i)) for i in range(node.size())]
     if node.isInt() or node.isReal():
         return node.real()
-    return node.string() if node.isString() else None
-
-
-def read_matrix(path: Path, key: str, value: Any) -> Array:
-    """Numbers of one key: a number, a list, an array, or a table with rows, cols and data."""
-    shape: tuple[int, ...] | None = None
-    try:
-        if isinstance(value, dict):
-            shape = (int(value["rows"]), int(value["cols"]))
-            value = value["data"]
-        numbers = np.asarray(value, dtype=object).ravel().astype(float)
-        numbers = numbers if shape is None else numbers.reshape(shape)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(f"{path}: key '{key}': must be numbers, or a matrix with rows, cols and data") from None
-    if not (np.abs(numbers) < HUGE).all():
-        raise InputError(f"{path}: key '{key}': holds a number that is not finite")
-    return np.asarray(numbers)
+    if node.isString():
+        return node.string()
+    return None

@@ -1,0 +1,227 @@
+"""Where several studies were made: all their verdicts as one picture and one table, before everything else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from consistency.bench.pages.sections.anees import anees_curves
+from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
+from consistency.referee.diagnostics.verdict.parts import STATUSES, Interval
+from consistency.referee.diagnostics.words.numbers import names_in_a_row, short
+from consistency.referee.document.blocks import (
+    Block,
+    Column,
+    Details,
+    Facts,
+    Figure,
+    Heading,
+    Name,
+    Reasons,
+    Settings,
+    Table,
+    Text,
+    table,
+)
+from consistency.referee.document.colours import BAND, EXPECTED, solid
+from consistency.referee.document.judged_filters import BRIEF, cells, columns
+from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.pages.verdicts import judgement, method
+from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+TITLE = "Which filter tells the truth about its uncertainty, and where?"
+QUESTION = (
+    "Herath, Kodagoda and Dissanayake (2007), Stereo Vision Based SLAM: Issues and Solutions, ask whether EKF and UKF "
+    "SLAM by a small stereo pair are consistent: whether their errors are as large as their covariances state. They "
+    "find that no filter they tried is at a baseline of 9 cm. Valencia and Andrade-Cetto (2018), SLAM Front-End, "
+    "propagate the covariance of stereo visual odometry in closed form and check it by its NEES."
+)
+ORIGIN = ("Command", "Date", "Git commit", "Runs", "Seed")  # facts on the first page
+ON_PAPER = ("ANEES of the pose", "NEES of the pose")  # figures of a study
+LABEL = "covariance ratio (truth / stated)"
+ROOM = 1.5  # factor between the outermost values and the edges of the picture
+WIDTHS = ("0.9fr", "auto", "auto")
+COLUMNS = (
+    Column("World", width="1.6fr"),
+    Column("Filter", width="1fr"),
+    *(replace(column, paper="", width=width) for column, width in zip(columns(BRIEF), WIDTHS, strict=True)),
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the interval of a filter in a world is drawn."""
+
+    track: Track
+    y: float  # row of its world, and beside the others in it
+    ratio: Interval
+
+
+def opening(report: Report) -> tuple[Block, ...]:
+    """A row of the picture for each world, a row of the table for each filter in it.
+
+    Before them, where the stereo sensor of the paper is one of the worlds, the papers' question and the NEES of all
+    filters there. Nothing where there is one study, whose verdicts are at hand anyway.
+    """
+    if len(report.studies) < 2 or not any(study.has_truth for study in report.studies):
+        return ()
+    main = report.main
+    question: tuple[Block, ...] = ()
+    if main is not None:
+        (curves,) = anees_curves(main)
+        question = Text(QUESTION), replace(curves, title=f"NEES over time at a baseline of {_baseline(main)}", level=2)
+    return *question, _origin(report), _picture(report), _table(report)
+
+
+def _origin(report: Report) -> Text:
+    """When and by which command the numbers were made, in one line."""
+    said = dict(facts(report.manifest))
+    parts = [f"{name.lower()}: {said[name]}" for name in ORIGIN if name in said]
+    return Text(f"{'; '.join(parts)}.", lead="Origin.")
+
+
+def main_sentence(studies: Sequence[Study]) -> str:
+    """Who is honest on the paper's stereo sensor, and who is not; empty where it was not run."""
+    main = next((study for study in studies if study.name == STEREO), None)
+    if main is None:
+        return ""
+    parts = []
+    for status in STATUSES:
+        ratios = {track.name: _ratio(track) for track in main.tracks if track.verdict.status == status}
+        if not ratios:
+            continue
+        known = sorted(ratio.value for ratio in ratios.values() if ratio is not None)
+        size = ""
+        if known:
+            size = f" (x{short(known[0])})" if len(known) == 1 else f" (by x{short(known[0])} to x{short(known[-1])})"
+        parts.append(f"{names_in_a_row(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
+    return f"At a baseline of {_baseline(main)}, {'; '.join(parts)}."
+
+
+def on_paper(study: Study, blocks: Sequence[Block]) -> tuple[Block, ...]:
+    """What the PDF shows of one of several studies: its verdicts, their first sentences, and its first figures."""
+    figures = [block for block in blocks if isinstance(block, Figure) and block.title in ON_PAPER]
+    return *(_brief(block) for block in judgement(study) if not isinstance(block, Heading)), *figures
+
+
+def _brief(block: Block) -> Block:
+    if not isinstance(block, Reasons):
+        return block
+    return Reasons(tuple(replace(entry, others=()) for entry in block.entries))
+
+
+def _baseline(study: Study) -> str:
+    scenario = study.results.scenario
+    assert scenario is not None
+    rig = scenario.truth.sensor.rig
+    assert rig is not None
+    return f"{100.0 * rig[1]:.3g} cm"
+
+
+def _table(report: Report) -> Table:
+    rows = [
+        (study.name, Name(track.name, track.look), *cells(BRIEF, track.verdict))
+        for study in report.studies
+        for track in study.tracks
+    ]
+    caption = "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane."
+    return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, style="narrow")
+
+
+def places(report: Report) -> list[Place]:
+    """Of every ratio that is known."""
+    return [
+        Place(track, row + dodge(slot, len(study.tracks)), ratio)
+        for row, study in enumerate(report.studies)
+        for slot, track in enumerate(study.tracks)
+        if (ratio := _ratio(track)) is not None
+    ]
+
+
+def window_of(intervals: list[Place], factor: float) -> tuple[float, float]:
+    """Drawn range of the ratios; ends of intervals are not reason for a wider one."""
+    values = [1.0 / factor, factor, *(place.ratio.value for place in intervals)]
+    return min(values) / ROOM, max(values) * ROOM
+
+
+def _picture(report: Report) -> Figure:
+    found = places(report)
+    factor = next(track for study in report.studies for track in study.tracks).verdict.settings.factor
+
+    def draw() -> Drawing:
+        figure, (axes,) = canvas(0.5 + 0.22 * len(report.studies))
+        axes.set(xlabel=LABEL, xlim=window_of(found, factor))
+        name_rows(axes, [study.name for study in report.studies])
+        axes.axvspan(
+            1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.4, label=f"tolerated: 1 / {factor:g} to {factor:g}"
+        )
+        axes.axvline(1.0, **stroke(EXPECTED), label="right")
+        for name in dict.fromkeys(place.track.name for place in found):
+            own = [place for place in found if place.track.name == name]
+            look = replace(solid(own[0].track.look), size=3.6, width=1.1)
+            intervals(axes, np.array([p.y for p in own]), np.array([p.ratio for p in own]), look, name)
+        log_axis(axes, "x")
+        return add_legend(figure)
+
+    caption = (
+        "By how much the covariance of the pose must grow to match the errors, with 95 % intervals; log axis. A filter "
+        "is shown to be honest where its whole interval lies in the shade and no other question found a fault; to the "
+        "right of it is overconfident. An arrow continues beyond the drawn range."
+    )
+    return Figure(TITLE, caption, (draw,), level=2)
+
+
+def _ratio(track: Track) -> Interval | None:
+    scale = track.verdict.scale
+    known = scale is not None and np.isfinite(scale.inflation.value) and scale.inflation.value > 0
+    return scale.inflation if known and scale is not None else None
+
+
+def verdicts(report: Report) -> tuple[Block, ...]:
+    """Verdicts of all filters in all studies, and how a verdict comes about."""
+    if not report.studies:
+        return (Text("No study was run for these findings."),)
+    blocks = [block for study in report.studies for block in judgement(study)]
+    return (*blocks, Text(method(report.studies), "How a verdict comes about.", "note"))
+
+
+SHORT = 4000  # characters of settings that surely fit on one page
+
+
+def provenance(report: Report) -> tuple[Block, ...]:
+    """What the manifest says, and of each study what it adds."""
+    rows = facts(report.manifest)
+    return Facts(rows), *(_study(study, rows, len(report.studies) > 1) for study in report.studies)
+
+
+def _study(study: Study, stated: tuple[tuple[str, str], ...], several: bool) -> Details:
+    """Facts of one study that the report does not state already, and its settings."""
+    rows = tuple(row for row in facts(study.results.manifest) if row not in stated)
+    settings = resolved(study)
+    what = "resolved belief" if study.is_log else "resolved scenario"
+    if several:
+        what = f"provenance and {what}"
+    blocks = (Facts(rows), Settings(settings)) if rows else (Settings(settings),)
+    return Details(f"{study.name}: {what}", blocks, whole=len(settings) < SHORT)
+
+
+def resolved(study: Study) -> str:
+    """The scenario, or the log's belief, as JSON."""
+    manifest = study.results.manifest
+    return json.dumps(_rounded(manifest.get("scenario") or manifest.get("belief") or {}), indent=2, ensure_ascii=False)
+
+
+def _rounded(value: Any) -> Any:
+    """Six digits of every number, to read; the manifest has them all."""
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -1,0 +1,75 @@
+"""Executors by name; what an extra brings is loaded when its backend is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+
+from consistency.bench.runs.local_workers import worker_count
+from consistency.referee.errors import InputError
+from consistency.referee.extras import MissingPackageError, remedy
+
+ENGINES = {"dask": "distributed", "slurm": "submitit"}  # package of each that is not local
+NAMES = ("local", *ENGINES)
+WAIT = 60.0  # s
+
+
+@contextmanager
+def executor_for(
+    name: str = "local",
+    jobs: int = -1,
+    scheduler: str | None = None,
+    slurm: Sequence[str] = (),
+    wait: float | None = None,
+    out: Path = Path("results"),
+) -> Iterator[Executor | None]:
+    """Yield the executor of a backend, which is shut down at the end; None for threads of this process.
+
+    Parameters
+    ----------
+    jobs : processes of this machine, or jobs of Slurm at a time; -1 for as many as the backend thinks right
+    scheduler : of ``dask``, see :class:`consistency.bench.runs.backends.dask.DaskExecutor`
+    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.backends.slurm.SlurmExecutor`
+    wait : seconds to wait for the scheduler of ``dask``, 60 if not given
+    out : folder of the results; ``slurm`` keeps the files of its jobs beside it, on a disk that they see
+
+    Raises
+    ------
+    InputError
+        Another name, an option of another backend, or a package that is not installed.
+    """
+    executor = _executor(name, jobs, scheduler, slurm, wait, out)
+    if executor is None:
+        yield None
+    else:
+        with executor:
+            yield executor
+
+
+def _executor(
+    name: str, jobs: int, scheduler: str | None, slurm: Sequence[str], wait: float | None, out: Path
+) -> Executor | None:
+    if name not in NAMES:
+        raise InputError(f"--backend must be one of {', '.join(NAMES)}, got '{name}'")
+    for option, owner, is_given in (
+        ("--scheduler", "dask", scheduler is not None),
+        ("--scheduler-wait", "dask", wait is not None),
+        ("--slurm", "slurm", bool(slurm)),
+    ):
+        if is_given and name != owner:
+            raise InputError(f"{option} goes with --backend {owner}, not with {name}")
+    if name == "local":
+        worker_count(jobs)
+        return None
+    try:
+        if name == "dask":
+            from consistency.bench.runs.backends.dask import DaskExecutor
+
+            return DaskExecutor(scheduler, jobs, WAIT if wait is None else wait)
+        from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
+
+        return SlurmExecutor(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
+    except ImportError:
+        raise MissingPackageError(f"--backend {name} needs {remedy('cluster', package=ENGINES[name])}") from None

@@ -1,0 +1,193 @@
+"""The outcome of one run: NEES and NIS of its steps, the map's, and in which step it failed, as rows of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.filters.kernel.linalg import definiteness
+from consistency.bench.store.parquet import Columns
+from consistency.bench.store.results import JOINT
+from consistency.bench.store.trial_tables import Rejected, truth_columns
+from consistency.bench.types import Estimates, Map, Trial
+from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
+from consistency.referee.diagnostics.maps.map_nees import joint_nees
+from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.geometry import pose_error
+from consistency.referee.geometry.conventions import planar_error, planar_map_error
+from consistency.referee.parsing import LARGEST_NUMBER
+from consistency.referee.types import Array, Failure
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """Results of one run: rows of the tables, by filter, and failures; ``machine`` did it, None for this one."""
+
+    run: int
+    estimates: dict[str, Columns]
+    truth: Columns | None
+    failures: tuple[Failure, ...]
+    maps: dict[str, Columns] = field(default_factory=dict)
+    rejections: tuple[Rejected, ...] = ()
+    machine: dict[str, str] | None = None
+
+
+def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> RunOutcome:
+    """Rows of the tables for one trial; a failed run has none from the failed step on.
+
+    A run whose pose, covariance, NEES or NIS is beyond :data:`LARGEST_NUMBER` has failed in that step.
+    """
+    estimates_and_rows = [_rows(trial, e) for e in estimates]
+    estimates = [e for e, _ in estimates_and_rows]
+    return RunOutcome(
+        trial.run,
+        {e.filter: columns for e, columns in estimates_and_rows},
+        None if trial.truth is None else truth_columns(trial, trial.truth),
+        tuple(e.failure for e in estimates if e.failure),
+        {e.filter: _map_columns(trial, e, e.map) for e in estimates if e.map is not None and e.failure is None},
+        tuple(_rejected(trial, e, e.rejected) for e in estimates if e.rejected is not None),
+    )
+
+
+def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
+    """Counts over the observations up to the end of the run, or to the step before its failure."""
+    rows = slice(trial.first[_last(trial, estimates)])
+    spurious, rejected = trial.spurious[rows], rejected[rows]
+    observation_counts = (len(rejected), spurious.sum(), rejected.sum(), (rejected & spurious).sum())
+    return Rejected(estimates.filter, trial.run, *(int(count) for count in observation_counts))
+
+
+def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
+    """Rows of ``estimates``, with what they are of: a run fails in the first step with a number that is too large."""
+    last, own = _last(trial, estimates), estimates.own
+    first = _full_rank((estimates.covariance if own is None else own)[:last])
+    columns = _columns(trial, estimates, last, first)
+    step, reason = _first_failure(columns, first, trial.truth is not None)
+    map_numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
+    if not step and not all((np.abs(values) <= LARGEST_NUMBER).all() for values in map_numbers):
+        step, reason = last, f"a number in the map is beyond {LARGEST_NUMBER:g}"
+    if not step:
+        return estimates, columns
+    failure = Failure(estimates.filter, estimates.run, step, reason)
+    return replace(estimates, failure=failure, map=None), {key: values[: step - 1] for key, values in columns.items()}
+
+
+def _first_failure(columns: Columns, first: int, has_truth: bool) -> tuple[int, str]:
+    """First step with a number that is too large, and which; 0 without one. A NEES counts after step ``first``."""
+    has_nees = columns["step"] > first if has_truth else np.zeros(len(columns["step"]), bool)
+    every_step = np.ones(len(has_nees), bool)
+    limited = {
+        "NEES": (("nees", "own_nees"), has_nees), "NIS": (("nis",), columns["nis_dof"] > 0),
+        "pose": (POSE, every_step), "covariance": ((*COVARIANCE, *OWN_COVARIANCE), every_step),
+    }  # fmt: skip
+    faults = []
+    for kind, (names, steps) in limited.items():
+        largest = np.max([np.abs(columns[name]) for name in names if name in columns], axis=0)  # NaN of any NaN
+        too_large = steps & ~(largest <= LARGEST_NUMBER)
+        if too_large.any():
+            step = int(too_large.argmax())
+            beyond = f"is beyond {LARGEST_NUMBER:g}" if np.isfinite(largest[step]) else "is not finite"
+            faults.append((step + 1, f"the {kind} {beyond}"))
+    return min(faults, key=lambda fault: fault[0], default=(0, ""))
+
+
+def _last(trial: Trial, estimates: Estimates) -> int:
+    """Steps with an estimate."""
+    return estimates.failure.step - 1 if estimates.failure else trial.steps
+
+
+def _columns(trial: Trial, estimates: Estimates, last: int, first: int) -> Columns:
+    """Columns of steps 1..``last``; there is a NEES after step ``first``."""
+    pose, P = estimates.pose[:last], estimates.covariance[:last]
+    true = None if trial.truth is None else trial.truth[1 : last + 1]
+    columns = {
+        "run": np.full(last, estimates.run),
+        "step": np.arange(1, last + 1),
+        "t": trial.t[1 : last + 1],
+        **dict(zip(POSE, pose.T, strict=True)),
+        **{name: P[:, i, j] for name, (i, j) in COVARIANCE.items()},
+        "nees": _nees(None if true is None else pose_error(true, pose), P, first),
+        "nis": estimates.nis[:last],
+        "nis_dof": estimates.nis_dof[:last],
+    }
+    if estimates.own is not None:
+        P, error = estimates.own[:last], None if true is None else planar_error(true, pose, estimates.error)
+        columns |= {name: P[:, i, j] for name, (i, j) in OWN_COVARIANCE.items()} | {"own_nees": _nees(error, P, first)}
+    return columns
+
+
+def _full_rank(P: Array) -> int:
+    """First of the covariances (T, 3, 3) that has full rank, or T.
+
+    That of the filter's own error decides: an additive one that is computed from it has small variances where there
+    are none, left by rounding.
+    """
+    return next((k for k in range(len(P)) if definiteness(P[k]) == 1), len(P))
+
+
+def _nees(error: Array | None, P: Array, first: int) -> Array:
+    """NEES of one run, (T, 3) and (T, 3, 3) -> (T,); NaN before step ``first``."""
+    nees = np.full(len(P), np.nan)
+    if error is not None:
+        # the filter has answered for P: what nees() checks need not be checked again
+        with np.errstate(over="ignore"):
+            whitened = whiten(error[first:], P[first:])
+            nees[first:] = np.einsum("ki,ki->k", whitened, whitened)
+    return nees
+
+
+def is_flat(covariance: Array) -> bool:
+    """Whether landmarks (K, 3, 3) are in a plane: their heights are not variables."""
+    return not covariance[:, 2].any()
+
+
+def _map_columns(trial: Trial, estimates: Estimates, map_: Map) -> Columns:
+    """Rows of ``map.parquet``; without NEES where the id is not a landmark of the world, or its place is not known."""
+    landmark_ids, count = map_.landmarks, len(map_.landmarks)
+    nees, joint = np.full(count, np.nan), np.full(count, np.nan)
+    if trial.landmarks is not None:
+        judged = (landmark_ids < len(trial.landmarks)) & ~np.isin(landmark_ids, trial.things)
+        dof = 2 if is_flat(map_.covariance) else 3
+        landmark_error = trial.landmarks[landmark_ids[judged]] - map_.mean[judged]
+        whitened_landmarks = whiten(landmark_error[:, :dof], map_.covariance[judged, :dof, :dof])
+        with np.errstate(over="ignore"):
+            nees[judged] = _capped(np.einsum("ki,ki->k", whitened_landmarks, whitened_landmarks))
+        joint[judged] = _joint_nees(trial, estimates, map_, judged)
+    return {
+        "run": np.full(count, trial.run),
+        "landmark": landmark_ids if trial.labels is None else trial.labels[landmark_ids],
+        **dict(zip("xyz", map_.mean.T, strict=True)),
+        **{name: map_.covariance[:, i, j] for name, (i, j) in POINT_COVARIANCE.items()},
+        "nees": nees,
+        JOINT: np.where(np.isinf(joint), joint, _capped(joint)),
+    }
+
+
+def _capped(nees: Array) -> Array:
+    """NEES of landmarks, no more than a table may hold."""
+    return np.minimum(nees, LARGEST_NUMBER)
+
+
+def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) -> Array:
+    """Parts (K,) of the joint NEES, in the filter's own error, of the landmarks that are ``judged``; NaN if not known.
+
+    The part of a landmark is that given the pose and the landmarks before it: independent of the others, and
+    chi-square with 3 degrees of freedom, or 2 in the plane, if the joint covariance is right.
+    """
+    if map_.joint is None or trial.truth is None or trial.landmarks is None:
+        return np.full(int(judged.sum()), np.nan)
+    landmark_ids, P = map_.landmarks[judged], map_.joint
+    if not judged.all():
+        kept_rows = np.repeat(np.append(True, judged), 3)
+        P = P[np.ix_(kept_rows, kept_rows)]
+    with one_blas_thread():
+        error, P = planar_map_error(
+            trial.truth[-1], trial.landmarks[landmark_ids], estimates.pose[-1], map_.mean[judged], P, estimates.error
+        )
+        if is_flat(map_.covariance):
+            flat = np.flatnonzero(np.append([1, 1, 1], np.tile([1, 1, 0], len(landmark_ids))))
+            return joint_nees(error[flat], P[np.ix_(flat, flat)], dof=2)[1:]
+        return joint_nees(error, P)[1:]

@@ -1,0 +1,95 @@
+"""Rows of the tables for one trial, from the arrays that filters give, and tables of the rows of many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from consistency.bench.store.parquet import BY_FILTER, Columns
+from consistency.bench.types import Trial
+from consistency.referee.column_names import COLUMNS, POSE
+from consistency.referee.types import Array, Failure
+
+
+class Rejected(NamedTuple):
+    """How many observations a guard was offered in a run, and what it rejected; a row of ``rejections``."""
+
+    filter: str
+    run: int
+    offered: int
+    spurious: int
+    rejected: int
+    rejected_spurious: int
+
+
+def truth_columns(trial: Trial, path: Array) -> Columns:
+    return {
+        "run": np.full(len(path), trial.run),
+        "step": np.arange(len(path)),
+        "t": trial.t,
+        **dict(zip(POSE, path.T, strict=True)),
+    }
+
+
+def stacked_table(name: str, parts: Sequence[tuple[str, Columns]], also: Sequence[str] = ()) -> pd.DataFrame:
+    """Table ``name`` of (filter, columns), one below the other; NaN where a column is lacking, one of ``also`` too.
+
+    The columns are nobody else's: pandas would copy them, at millions of rows half the memory.
+    """
+    table = pd.DataFrame(columns=list(COLUMNS[name])).astype(COLUMNS[name])
+    if parts:
+        rows, stacked = [len(columns["run"]) for _, columns in parts], dict[str, Any]()
+        if name in BY_FILTER:
+            filter_names = pd.Series([filter_name for filter_name, _ in parts], dtype="str")
+            stacked["filter"] = filter_names.repeat(rows).reset_index(drop=True)
+        for column in dict.fromkeys(column for _, part in parts for column in part):
+            pairs = zip(parts, rows, strict=True)
+            column_pieces = [part[column] if column in part else np.full(n, np.nan) for (_, part), n in pairs]
+            stacked[column] = np.concatenate(column_pieces)
+        table = pd.DataFrame(stacked, copy=False)
+    missing_columns = [column for column in also if column not in table]
+    return table.assign(**dict.fromkeys(missing_columns, np.nan)) if missing_columns else table
+
+
+def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
+    """``failures.parquet`` or ``rejections.parquet``."""
+    return pd.DataFrame(rows, columns=list(COLUMNS[name])).astype(COLUMNS[name])
+
+
+def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.full(t.steps, t.run),
+                    "step": np.arange(1, t.steps + 1),
+                    **dict(zip(["dt", "v", "omega"], t.controls.T, strict=True)),
+                }
+            )
+            for t in trials
+        ],
+        ignore_index=True,
+    )
+
+
+def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
+    has_sources = any(t.source is not None for t in trials)
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "run": np.full(len(t.landmark), t.run),
+                    "step": t.step,
+                    "landmark": t.landmark,
+                    **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
+                    **({"source": t.landmark if t.source is None else t.source} if has_sources else {}),
+                }
+            )
+            for t in trials
+        ],
+        ignore_index=True,
+    )

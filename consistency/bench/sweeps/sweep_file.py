@@ -1,0 +1,302 @@
+"""A sweep's file: the world it starts from, the grid, the filters and the rule; expanded to cells."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator
+
+from consistency.bench.filters import get_filter
+from consistency.bench.filters.filter_declarations import resolve_filters
+from consistency.bench.runs.run_until_decided import plan_of
+from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
+from consistency.bench.scenario.truth_and_belief import unknown, with_changes
+from consistency.bench.sweeps.sweep_axes import QUANTITIES, Axis, is_number, leaves, require_key
+from consistency.referee.column_names import POSE
+from consistency.referee.defaults import DETECT, POWER
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import HUGE
+
+MOST_CELLS = 20_000  # each is a scenario in memory, and a folder
+LONGEST = 150  # characters of a folder's name
+REFERENCE = {"uvd": "ekf-uvd", "xyz": "ekf-xyz", "linear": "kf"}  # filter whose step costs 1, by the sensor's model
+
+
+class StoppingRule(Table):
+    """When a cell is decided; the keys are those of ``consistency run --until-decided``."""
+
+    false_alarm: Positive = 0.01
+    detect: Positive = DETECT
+    power: Positive = POWER
+    max_runs: Count = 192
+
+
+class SweepFile(Table):
+    summary: str
+    base: str  # name or path of a scenario
+    filters: Annotated[list[str], Field(min_length=1)]
+    seed: Annotated[int, Field(ge=0, strict=True)] = 0
+    rule: StoppingRule = StoppingRule()
+    grid: dict[str, Any] = Field(default_factory=dict)
+    alone: dict[str, Any] = Field(default_factory=dict)  # each from the base's value, at every point of the grid
+
+    @field_validator("grid", "alone")
+    @classmethod
+    def _flat(cls, grid: dict[str, Any]) -> dict[str, Any]:
+        """``truth.path.speed = [...]`` may stand with or without quotes."""
+        return dict(leaves(grid))
+
+
+@dataclass(frozen=True)
+class Cell:
+    number: int  # 0, 1, ... in the order of :func:`grid_points`
+    indices: tuple[int, ...]  # place on each axis
+    name: str  # of its folder
+    text: str  # "baseline 0.09 m, range 4 m"
+    scenario: Scenario
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Scenarios, filters, and the rule by which each filter is judged in each of them.
+
+    The scenarios are those of a grid, and at each of its points those in which one more axis has another value.
+    """
+
+    name: str
+    summary: str
+    base: Scenario
+    axes: tuple[Axis, ...]
+    filters: tuple[str, ...]
+    seed: int
+    rule: StoppingRule
+
+    @property
+    def grid(self) -> tuple[Axis, ...]:
+        """Axes whose values are combined."""
+        return tuple(axis for axis in self.axes if axis.home is None)
+
+    @property
+    def alone(self) -> tuple[Axis, ...]:
+        """Axes that vary one at a time."""
+        return tuple(axis for axis in self.axes if axis.home is not None)
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """Every cell, in the order of :func:`grid_points`; raises ValueError where a scenario is refused."""
+        return tuple(self._cell(number, at) for number, at in enumerate(grid_points(self.axes)))
+
+    def _cell(self, number: int, at: tuple[int, ...]) -> Cell:
+        changes: dict[str, Any] = {}
+        for axis, i in _changed(self.axes, at):
+            changes |= axis.changes(self.base, axis.values[i])
+        name, text = _folder_name(self.axes, at), text_of(self.axes, at)
+        return Cell(number, at, name, text, with_changes(self.base, name, f"{self.base.name}, {text}", changes))
+
+    @property
+    def reference(self) -> str:
+        """The filter whose step costs 1."""
+        return REFERENCE[self.base.belief.sensor.model]
+
+    def seed_of(self, cell: Cell) -> int:
+        """The cell's own seed: its trials depend on its scenario, not on its place or on other cells."""
+        digest = hashlib.sha256(f"{self.seed} {cell.scenario.hash}".encode()).digest()
+        return int.from_bytes(digest[:4], "big")
+
+
+def grid_points(axes: Sequence[Axis]) -> Iterator[tuple[int, ...]]:
+    """Places on all axes: those of the grid, the last axis fastest, each with the values of one more axis alone."""
+    choices = [range(len(axis.values)) if axis.home is None else (axis.home,) for axis in axes]
+    for grid_point in itertools.product(*choices):
+        yield grid_point
+        for k, axis in enumerate(axes):
+            for i in range(len(axis.values)):
+                if axis.home not in (None, i):
+                    yield (*grid_point[:k], i, *grid_point[k + 1 :])
+
+
+def number_of_points(axes: Sequence[Axis]) -> int:
+    grid_points, values_alone = 1, 0
+    for axis in axes:
+        if axis.home is None:
+            grid_points *= len(axis.values)
+        else:
+            values_alone += len(axis.values) - 1
+    return grid_points * (1 + values_alone)
+
+
+def values_of(sweep: Sweep, axes: Sequence[Axis], cell: Cell) -> list[str]:
+    """A cell's values on some axes, and in a sweep with axes that vary alone what of the cell does."""
+    axis_places = [cell.indices[sweep.axes.index(axis)] for axis in (*axes, *sweep.alone)]
+    alone_text = [text_of(sweep.alone, axis_places[len(axes) :])] if sweep.alone else []
+    return [*map(Axis.say, axes, axis_places), *alone_text]
+
+
+def _changed(axes: Sequence[Axis], at: Sequence[int]) -> list[tuple[Axis, int]]:
+    """Axes at which a cell is not the base by definition, with its place there."""
+    return [(axis, i) for axis, i in zip(axes, at, strict=True) if i != axis.home]
+
+
+def text_of(axes: Sequence[Axis], at: Sequence[int]) -> str:
+    """A place in words, without axes on which it is that of the base."""
+    return ", ".join(f"{axis.text} {axis.say(i)}" for axis, i in _changed(axes, at)) or "the base"
+
+
+def _folder_name(axes: Sequence[Axis], at: Sequence[int]) -> str:
+    folder_parts = []
+    for axis, i in _changed(axes, at):
+        value = axis.values[i]
+        value_text = f"{value:.12g}" if isinstance(value, float) else str(value)
+        folder_parts.append(f"{axis.key}-{re.sub(r'[^A-Za-z0-9.+-]+', '_', value_text).strip('_')}")
+    name = "_".join(folder_parts) or "base"
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+# --- reading ----------------------------------------------------------------------------------------
+
+
+def _shipped() -> Path:
+    return data_folder("experiments") / "sweeps"
+
+
+def sweep_names() -> list[str]:
+    return sorted(path.stem for path in _shipped().glob("*.toml"))
+
+
+def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
+    """A sweep by built-in name or by path to a ``.toml`` file, every cell checked.
+
+    Parameters
+    ----------
+    filters : in place of those of the file
+
+    Raises
+    ------
+    InputError
+        Unknown name, unreadable file, unknown key, a value that a cell may not have, a filter that does not fit.
+    """
+    path = Path(name)
+    if str(name) in sweep_names():
+        path = _shipped() / f"{name}.toml"
+    elif path.suffix != ".toml":
+        raise InputError(f"{unknown('sweep', str(name), sweep_names())}; or give a .toml file or a folder of 'sweep'")
+    file = read_table(path, SweepFile)
+    try:
+        beside = path.parent / file.base
+        base = load_scenario(beside if file.base.endswith(".toml") else file.base)
+        if filters:
+            file = file.model_copy(update={"filters": list(filters)})
+        sweep = sweep_of(path.stem, file, base)
+        plan_of(sweep.rule.model_dump() | {"dof": len(POSE)})
+        for filter_ in sweep.filters:
+            get_filter(filter_)
+        resolve_filters(sweep.filters, sweep.base.belief)
+        _require_cells(sweep)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+    return sweep
+
+
+def sweep_of(name: str, file: SweepFile, base: Scenario) -> Sweep:
+    """Expand the content of a sweep's file; the cells are made when they are asked for.
+
+    Raises
+    ------
+    InputError
+        A key of no scenario, a value that may not be, or too many cells.
+    """
+    if not (file.grid or file.alone):
+        raise InputError("key 'grid': missing; give it axes, or a table 'alone' of axes that vary one at a time")
+    if both := [key for key in file.grid if key in file.alone]:
+        raise InputError(f"key 'alone.{both[0]}': stands in 'grid', too; leave one of them out")
+    axes = [_axis("grid", key, values, base) for key, values in file.grid.items()]
+    axes += [_axis("alone", key, values, base) for key, values in file.alone.items()]
+    count = number_of_points(axes)
+    if count > MOST_CELLS:
+        raise InputError(f"key 'grid': makes {count} cells; at most {MOST_CELLS}, so take fewer values, or two sweeps")
+    return Sweep(name, file.summary, base, tuple(axes), tuple(file.filters), file.seed, file.rule)
+
+
+def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
+    name = f"key '{table}.{key}'"
+    if not isinstance(values, list) or not values:
+        raise InputError(f"{name}: must be a list of one value or more, got {values!r}")
+    if any(values.count(value) > 1 for value in values):
+        raise InputError(f"{name}: a value is given twice; each may stand once")
+    for value in values:
+        if key in QUANTITIES:
+            _require_quantity(name, key, value)
+        if is_number(value) and not -HUGE <= value <= HUGE:
+            raise InputError(f"{name}: numbers must be finite, and {HUGE:g} at most")
+    if all(map(is_number, values)):
+        is_whole = all(isinstance(value, int) for value in values)
+        values = sorted(values if is_whole else map(float, values))
+    axis = Axis(key, tuple(values), None if table == "grid" else 0)
+    require_key(axis, base)
+    return axis if table == "grid" else alone(axis, base)
+
+
+def _require_quantity(name: str, key: str, value: Any) -> None:
+    low, kind = (0.0, "positive numbers") if QUANTITIES[key].positive else (-math.inf, "numbers")
+    if not is_number(value) or not low < value < math.inf:
+        raise InputError(f"{name}: values must be {kind}, got {value!r}")
+
+
+def alone(axis: Axis, base: Scenario) -> Axis:
+    """The axis with the base's own value among its values, from which it varies.
+
+    Raises
+    ------
+    InputError
+        The base has no such value.
+    """
+    base_value = axis.own(base)
+    if base_value is None or base_value != base_value:
+        raise InputError(f"key 'alone.{axis.key}': {base.name} has no value there to start from; use 'grid'")
+    values = axis.values if base_value in axis.values else (base_value, *axis.values)
+    if all(map(is_number, values)):
+        values = tuple(sorted(values))
+    return Axis(axis.key, values, values.index(base_value))
+
+
+def _require_cells(sweep: Sweep) -> None:
+    """Check every value alone, so that the message names its key; then every cell, and a folder's name for each."""
+    axis_by_key: dict[str, str] = {}
+    for axis in sweep.axes:
+        keys = _keys_of(axis, sweep.base)
+        for key in keys:
+            if key in axis_by_key:
+                both = f"'grid.{axis_by_key[key]}' and '{axis.table}.{axis.key}'"
+                raise InputError(f"keys {both} both set {key}; leave one of them out")
+        if axis.home is None:  # axes that vary alone never meet
+            axis_by_key |= dict.fromkeys(keys, axis.key)
+    try:
+        names = Counter(cell.name for cell in sweep.cells)
+    except ValueError as error:
+        raise InputError(f"key 'grid': some values do not go together: {explain(error, Scenario)}") from None
+    name, cells_of_name = names.most_common(1)[0]
+    if cells_of_name > 1:
+        raise InputError(f"key 'grid': two values are too much alike to be told apart ({name})")
+
+
+def _keys_of(axis: Axis, base: Scenario) -> list[str]:
+    """Keys of the scenario that an axis sets; each of its values is tried in the base."""
+    scenario_keys: list[str] = []
+    for value in axis.values:
+        try:
+            changes = axis.changes(base, value)
+            with_changes(base, base.name, "", changes)
+        except ValueError as error:
+            text = explain(error, Scenario)
+            raise InputError(f"key '{axis.table}.{axis.key}', value {value!r}: {text}") from None
+        scenario_keys = list(changes)
+    return scenario_keys

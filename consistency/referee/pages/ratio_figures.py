@@ -1,0 +1,250 @@
+"""Covariance ratio, bias and coverage by axis of the pose, and the ratio by groups of runs and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.words.numbers import UNCERTAIN
+from consistency.referee.document.blocks import Block, Cell, Column, Details, Figure, Quantity, table
+from consistency.referee.document.colours import EXPECTED, solid
+from consistency.referee.pages.judged_estimators import Judged
+from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
+from consistency.referee.document.colours import ACCEPTED, BAND, REJECTED, Look
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
+
+Interval = tuple[float, float, float]  # value, low, high; the ends may be infinite
+Row = tuple[str, tuple[Interval | None, ...]]  # an axis, and an interval or None for each filter
+
+WHOLE, DIRECTION = "all axes", "worst direction"
+FAR = 30.0  # an interval that reaches further than this factor beyond all values is cut off
+
+
+@dataclass(frozen=True)
+class Forest:
+    """One quantity of the axes, with intervals."""
+
+    name: str
+    label: str  # of the axis with its unit
+    expected: float
+    window: tuple[float, float]  # drawn range
+    log: bool
+    rows: tuple[Row, ...]
+
+
+def by_axis(study: Judged) -> tuple[Block, ...]:
+    """A panel for each quantity, in which each axis has a row, and the ratios in numbers; nothing if there are none."""
+    found = forests(study)
+    if not found:
+        return ()
+    labels = row_labels(found)
+
+    def draw() -> Drawing:
+        height = 0.5 + len(labels) * (0.13 + 0.07 * len(study.tracks))
+        figure, panels = canvas(height, len(found), len(found))
+        for axes, forest in zip(panels, found, strict=True):
+            _draw_forest(axes, study, forest, labels)
+        for axes in panels[1:]:
+            axes.set_yticklabels([])
+        return add_legend(figure)
+
+    return Figure("By axis", axis_caption(study, found), (draw,), level=4), *_in_numbers(study, found)
+
+
+def _in_numbers(study: Judged, found: tuple[Forest, ...]) -> tuple[Details, ...]:
+    """The covariance ratios of the figure, as a table to unfold."""
+    ratios = [forest for forest in found if forest.name == "ratio"]
+    if not ratios:
+        return ()
+    columns = (Column("Axis"), *(Column(track.name, number=True) for track in study.tracks))
+    rows: list[tuple[Cell, ...]] = [(name, *map(_quantity, intervals)) for name, intervals in ratios[0].rows]
+    shown = table(columns, rows, f"Covariance ratio by axis of {study.name}")
+    return (Details("Covariance ratio by axis, in numbers", (shown,)),)
+
+
+def _quantity(interval: Interval | None) -> Quantity:
+    if interval is None:
+        return Quantity(None)
+    value, low, high = interval
+    return Quantity(value, (low, high), limit=UNCERTAIN, is_factor=True)
+
+
+def row_labels(found: tuple[Forest, ...]) -> tuple[str, ...]:
+    """Names of all rows, in one order, the whole last."""
+    names = dict.fromkeys(name for forest in found for name, _ in forest.rows)
+    return tuple(sorted(names, key=lambda name: name == WHOLE))
+
+
+def _draw_forest(axes: Axes, study: Judged, forest: Forest, labels: tuple[str, ...]) -> None:
+    """Intervals of all filters, one beside the other in the row of each axis."""
+    axes.set(xlabel=forest.label, xlim=forest.window)
+    name_rows(axes, labels)
+    axes.axvline(forest.expected, **stroke(EXPECTED))
+    slots = len(study.tracks)
+    for slot, track in enumerate(study.tracks):
+        rows = [(labels.index(label), own) for label, row in forest.rows if (own := row[slot]) is not None]
+        if rows:
+            places = np.array([place + dodge(slot, slots) for place, _ in rows])
+            look = replace(solid(track.look), size=3.2, width=1.1)
+            intervals(axes, places, np.array([own for _, own in rows]), look, track.name, track.tag)
+    if forest.log:
+        log_axis(axes, "x")
+
+
+def forests(study: Judged) -> tuple[Forest, ...]:
+    """Covariance ratio, bias and coverage by axis; those that no filter has are left out."""
+    kinds = (
+        ("ratio", "ratio (truth / stated)", 1.0, ratio_window, True, _ratios),
+        ("bias", "mean error (stated sigma)", 0.0, _bias_window, False, _biases),
+        ("coverage", "within 2 sigma (%)", 100.0 * TWO_SIGMA, _coverage_window, False, _coverages),
+    )
+    result = []
+    for name, label, expected, window, log, intervals_of in kinds:
+        rows = _rows(study, intervals_of)
+        if rows:
+            known = [interval for _, row in rows for interval in row if interval is not None]
+            result.append(Forest(name, label, expected, window(known), log, rows))
+    return tuple(result)
+
+
+def _rows(study: Judged, intervals_of: Callable[[Verdict], dict[str, Interval]]) -> tuple[Row, ...]:
+    by_filter = [{k: i for k, i in intervals_of(t.verdict).items() if np.isfinite(i[0])} for t in study.tracks]
+    names = dict.fromkeys(name for intervals in by_filter for name in intervals)
+    return tuple((name, tuple(intervals.get(name) for intervals in by_filter)) for name in names)
+
+
+def _ratios(v: Verdict) -> dict[str, Interval]:
+    intervals: dict[str, Interval] = {}
+    if v.axes is not None:
+        intervals |= v.axes.inflation
+        if v.axes.largest is not None:
+            intervals[DIRECTION] = v.axes.largest
+    if v.scale is not None:
+        intervals[WHOLE] = v.scale.inflation
+    return {name: interval for name, interval in intervals.items() if interval[0] > 0}
+
+
+def _biases(v: Verdict) -> dict[str, Interval]:
+    return {} if v.bias is None else dict(v.bias.by_axis)
+
+
+def _coverages(v: Verdict) -> dict[str, Interval]:
+    if v.accuracy is None or v.axes is None:
+        return {}
+    rows = zip(v.axes.names, v.accuracy.coverage_one_step, v.accuracy.coverage_interval, strict=True)
+    return {axis: (100.0 * float(share), 100.0 * float(low), 100.0 * float(high)) for axis, share, (low, high) in rows}
+
+
+def ratio_window(intervals: list[Interval]) -> tuple[float, float]:
+    values = [value for value, _, _ in intervals] + [1.0]
+    ends = [end for interval in intervals for end in interval if np.isfinite(end) and end > 0] + [1.0]
+    return max(min(ends), min(values) / FAR) / 1.3, min(max(ends), max(values) * FAR) * 1.3
+
+
+def _bias_window(intervals: list[Interval]) -> tuple[float, float]:
+    most = 3.0 * max(abs(value) for value, _, _ in intervals) + 3.0
+    ends = [float(np.clip(end, -most, most)) for interval in intervals for end in interval if np.isfinite(end)]
+    room = 0.06 * (max([*ends, 0.0]) - min([*ends, 0.0])) or 1.0
+    return min([*ends, 0.0]) - room, max([*ends, 0.0]) + room
+
+
+def _coverage_window(intervals: list[Interval]) -> tuple[float, float]:
+    return max(min(low for _, low, _ in intervals) - 5.0, -3.0), 103.0
+
+
+def axis_caption(study: Judged, found: tuple[Forest, ...]) -> str:
+    """What the panels show."""
+    parts, tracks = {forest.name for forest in found}, study.tracks
+    text = "Covariance ratio: 1 is right (line), above is overconfident; log axis."
+    if any(t.verdict.location is not None and t.verdict.location.since is not None for t in tracks):
+        text += " Ratio and bias are those since the step that the verdict names."
+    if any(track.verdict.axes is not None and track.verdict.axes.largest is not None for track in tracks):
+        text += f" {DIRECTION.capitalize()}: chosen by one half of the runs and measured in the other."
+    if "bias" in parts:
+        text += " Bias: mean error in units of the stated sigma; 0 is right."
+    if "coverage" in parts:
+        text += " Coverage: share of runs within 2 sigma, in one step of each; 95.4 % is right."
+    return (
+        f"{text} Bars: 95 % intervals, of ratio and bias for all axes at once, of coverage exact for each axis; an "
+        "arrow continues beyond the drawn range. The questions decide, not the bars."
+    )
+
+
+OPEN = Look("#7f7f7f")
+
+
+def ratio_by_group_figure(verdict: Verdict) -> tuple[Figure, ...]:
+    """A row for each group with its ratio and interval, a panel for each part; nothing without groups."""
+    of_parts = {name: part.by_group for name, part in verdict.parts.items() if part.by_group is not None}
+    if verdict.by_group is not None:
+        of_parts = {"": verdict.by_group}
+    if not of_parts:
+        return ()
+    first, factor = next(iter(of_parts.values())), verdict.settings.factor
+    labels = tuple(dict.fromkeys(group.name for by in of_parts.values() for group in by.groups))
+
+    def draw() -> Drawing:
+        figure, panels = canvas(0.5 + 0.2 * len(labels), len(of_parts), len(of_parts))
+        for axes, (name, by) in zip(panels, of_parts.items(), strict=True):
+            _draw_groups(axes, by, labels, factor)
+            axes.set_title(name)
+        for axes in panels[1:]:
+            axes.set_yticklabels([])
+        return add_legend(figure)
+
+    return (Figure(f"By {first.column}", _caption(of_parts), (draw,)),)
+
+
+def _draw_groups(axes: Axes, by: ByGroup, labels: tuple[str, ...], factor: float) -> None:
+    """Intervals of the groups, in a colour for each kind of verdict."""
+    drawn = [group for group in by.groups if group.ratio.value > 0]
+    axes.set(xlabel="covariance ratio (true / stated)", xlim=ratio_window([(*group.ratio,) for group in drawn]))
+    name_rows(axes, labels)
+    axes.axvspan(1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.5, label="consistent if shown inside")
+    axes.axvline(1.0, **stroke(EXPECTED))
+    kinds: dict[str, list[Group]] = {}
+    for group in drawn:
+        kinds.setdefault(group.status or "not judged", []).append(group)
+    for kind, groups in kinds.items():
+        rows = np.array([float(labels.index(group.name)) for group in groups])
+        intervals(axes, rows, np.array([tuple(group.ratio) for group in groups]), _look(kind), kind)
+    log_axis(axes, "x")
+
+
+def _look(status: str) -> Look:
+    """At fault, shown to be right, or neither."""
+    look = OPEN
+    if status in SIDES:
+        look = REJECTED
+    elif status == "consistent":
+        look = ACCEPTED
+    return replace(look, size=3.2, width=1.1)
+
+
+def _caption(of_parts: Mapping[str, ByGroup]) -> str:
+    """What the rows show, and what they do not."""
+    first = next(iter(of_parts.values()))
+    text = (
+        f"Ratio of true to stated covariance in each group by {first.column}: 1 is right (line), above is "
+        "overconfident; log axis. Bars: 95 % intervals for all groups at once, from the run means of their steps. "
+    )
+    if first.outcome:
+        return f"{text}{first.column} {first.outcome}, which selects on the outcome: groups show, they do not convict."
+    return f"{text}The questions decide, not the bars."

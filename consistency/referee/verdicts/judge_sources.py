@@ -1,0 +1,141 @@
+"""Sources of records, whatever they are, and the way from there to verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from consistency.referee.diagnostics.judge_record import judge
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.errors import InputError
+from consistency.referee.readers.pipeline.read_files import is_program_runs
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.planning.early_stopping import Design
+    from consistency.referee.diagnostics.records.skipped_start import Skip
+
+OPTION = {"ratio": "detect", "false_alarm": "false-alarm", "max_runs": "max-runs"}  # as commands call settings
+
+
+@dataclass(frozen=True)
+class Source:
+    """Records of several estimators on the same trials, each read when it is asked for."""
+
+    filters: Sequence[str]
+    record: Callable[[str], Record]  # by name; raises InputError of a name that is not there
+    design: Callable[[], Design | None] = lambda: None  # looks at growing numbers of runs, if they were run by one
+    has_truth: bool = True  # False: no record has a NEES
+    scenario: str | None = None
+    trials: tuple[Any, Any] = (None, None)  # scenario hash and seed, or what a log holds: equal for the same trials
+    unfinished: str = ""  # number of runs, where some are missing
+    settings: Settings | None = None  # by which they were judged when they were run; the defaults if None
+    skip: Skip | None = None  # first steps that were left out then
+    optimal_gain: bool = False  # declared then
+
+
+def source_of(of: Source | Sequence[Record]) -> Source:
+    """Return records as a source."""
+    if isinstance(of, Source):
+        return of
+    named: dict[str, Record] = {record.name: record for record in of}
+
+    def record(name: str) -> Record:
+        if name not in named:
+            raise InputError(f"--filter {name}: is not in these files; there are: {', '.join(named)}")
+        return named[name]
+
+    return Source(list(named), record)
+
+
+def files_source(path: Path, records: Sequence[Record]) -> Source:
+    """Return records of files as a source; runs of a program are judged as they were when they were run."""
+    source = source_of(records)
+    if not is_program_runs(path):
+        return source
+    from consistency.referee.readers.pipeline.program_runs import study_in
+
+    study = study_in(path)
+    return replace(
+        source, design=lambda: study.design, unfinished=study.unfinished, settings=study.settings,
+        skip=skip_asked(study.manifest["skip"]), optimal_gain=study.manifest["optimal_gain"],
+    )  # fmt: skip
+
+
+def judge_all(
+    results: Source | Sequence[Record],
+    filters: Sequence[str] | None = None,
+    confidence: float | None = None,
+    settings: Settings | None = None,
+    skip: str | float | Skip | None = None,
+    optimal_gain: bool = False,
+) -> dict[str, Verdict]:
+    """Judge every filter of the records, or those named; :func:`consistency.analyse` has the parameters."""
+    source = source_of(results)
+    design = None
+    if settings is None:
+        settings = settings_of(confidence)
+        if confidence is None:
+            settings = source.settings or settings
+            design = source.design()
+    first = skip_asked(skip) or source.skip
+    verdicts = {}
+    for name in filters or source.filters:
+        record = source.record(name)
+        if first is not None and record.skipped is None:
+            record = record.without_first(first)
+        if optimal_gain or source.optimal_gain:
+            record = replace(record, optimal_gain=True)
+        verdicts[name] = judge(record, settings, design)
+    return verdicts
+
+
+# --- what the options of a command ask for -----------------------------------------------------------
+
+
+def settings_of(confidence: float | None = None, **given: Any) -> Settings:
+    """Settings of a verdict from the options of a command; those that are None keep their defaults.
+
+    Raises
+    ------
+    InputError
+        A value out of its range, or both a confidence and a false-alarm rate.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if confidence is not None:
+        if "false_alarm" in given:
+            raise InputError("--confidence is 1 less --false-alarm; give one of them")
+        if not 0.0 < confidence < 1.0:
+            raise InputError(f"confidence must lie between 0 and 1, got {confidence}")
+        given["false_alarm"] = 1.0 - confidence
+    try:
+        return Settings(**given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def skip_asked(given: str | float | Skip | None) -> Skip | None:
+    """The first steps or seconds that an option asks to leave out.
+
+    Raises
+    ------
+    InputError
+        It is neither a number of steps nor of seconds.
+    """
+    if given is None:
+        return None
+    from consistency.referee.diagnostics.records.skipped_start import skip_of
+
+    try:
+        return skip_of(given)
+    except ValueError as error:
+        raise refused(error) from None
+
+
+def refused(error: ValueError) -> InputError:
+    """What a plan refuses, with the option of the command in place of the argument."""
+    name, rest = str(error).split(" ", 1)
+    return InputError(f"--{OPTION.get(name, name)} {rest}")

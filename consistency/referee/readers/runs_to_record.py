@@ -296,7 +296,7 @@ def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence
     variances = []
     of_part = []
     for p, error in zip(e.runs, errors, strict=True):
-        variances.append(np.diagonal(p.covariance, axis1=1, axis2=2)[p.stated][:, part])
+        variances.append(p.variances[p.stated][:, part])
         of_part.append(error[:, part])
     idle = not_estimated(of_part, variances)
     if not idle.any():

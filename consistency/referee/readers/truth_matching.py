@@ -249,6 +249,11 @@ class Poses:
         return 2 if self.covariance.shape[-1] == 3 else 3
 
     @property
+    def variances(self) -> Array:
+        """Diagonals of the covariances, (N, n)."""
+        return np.diagonal(self.covariance, axis1=1, axis2=2)
+
+    @property
     def seconds(self) -> Array:
         """Time of each estimate, (N,), s; NaN where steps have none."""
         if not self.numbered:

@@ -231,6 +231,23 @@ def test_speeds_of_several_runs_are_refused(inside):
         cs.read("odo.csv", truth="truth.csv", motions=True, relative=1)
 
 
+def test_a_nis_that_cannot_be_is_refused_with_its_place(inside):
+    nis = np.ones((2, 4))
+    nis[1, 2] = -2.0
+    errors = np.random.default_rng().normal(size=(2, 4, 1))
+    rows = {"errors": errors, "covariances": np.ones((2, 4, 1, 1))}
+    np.savez("a.npz", nis=nis, nis_dof=2, **rows)
+    with pytest.raises(cs.InputError, match=r"a\.npz, run 1, step 3: nis -2 with nis_dof 2; nis must be 0 or more"):
+        cs.read("a.npz")
+    nis[1, 2] = np.nan
+    np.savez("a.npz", nis=nis, nis_dof=np.where(np.isnan(nis), -1, 2), **rows)
+    assert cs.read("a.npz").nis_dof[1].tolist() == [2, 2, 0, 2]
+    plane("heading", nis=np.arange(6.0) - 1.0, nis_dof=2).to_csv("est.csv", index=False)
+    plane("heading").to_csv("truth.csv", index=False)
+    with pytest.raises(cs.InputError, match=r"est\.csv, line 2: nis -1 with nis_dof 2"):
+        cs.read("est.csv", truth="truth.csv")
+
+
 # --- files written again -----------------------------------------------------------------------------
 
 

@@ -45,7 +45,7 @@ class Ratio(NamedTuple):
     gates: tuple[str, ...]  # parameters
 
 
-class Stated(NamedTuple):
+class LoggedSensor(NamedTuple):
     """Innovations of a sensor with their variances."""
 
     message: str
@@ -62,8 +62,8 @@ RATIOS = {
     "tas": Ratio("SVT", 1, ("EAS",)),
 }  # by sensor
 STATED = {
-    "odometry": Stated("XKFD", ("IX", "IY", "IZ"), ("IVX", "IVY", "IVZ"), 1),
-    "beacon": Stated("XKF0", ("innov",), ("SIV",), 2),
+    "odometry": LoggedSensor("XKFD", ("IX", "IY", "IZ"), ("IVX", "IVY", "IVZ"), 1),
+    "beacon": LoggedSensor("XKF0", ("innov",), ("SIV",), 2),
 }  # by sensor
 
 

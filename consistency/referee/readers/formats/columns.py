@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -69,8 +69,17 @@ class Entries(NamedTuple):
 
     def without_cross_terms(self, n: int) -> bool:
         """Whether each of n components is stated by itself; a single variance is a whole covariance."""
-        is_diagonal = n > 1 and set(self.places) == {(i, i) for i in range(n)}
+        is_diagonal = n > 1 and set(self.places) == _diagonal(n)
         return is_diagonal or not self.squared
+
+    def in_order(self, n: int) -> tuple[int, ...]:
+        """Places of the upper triangle, row by row, or of n components by themselves; none where one is not there."""
+        pairs = list(itertools.combinations_with_replacement(range(n), 2))
+        if self.without_cross_terms(n):
+            pairs = [(i, i) for i in range(n)]
+        found = [self.places.get((i, j), self.places.get((j, i))) for i, j in pairs]
+        there = tuple(place for place in found if place is not None)
+        return there if len(there) == len(pairs) else ()
 
 
 def entry_name(axes: Sequence[str], i: int, j: int) -> str:
@@ -85,34 +94,65 @@ def covariance_columns(names: Sequence[str], axes: Sequence[str]) -> Entries:
 
     Of several other spellings that with most columns counts; deviations count where no covariance is there.
     """
+    words = [tuple(plain_names(axes))]
+    if is_pose(words[0]):
+        words = [("x", "y", heading) for heading in (*known.HEADINGS, *known.SHORT_HEADINGS)]
+    for first in (1, 0):
+        words.append(tuple(map(str, range(first, first + len(axes)))))
+    return next(_stated(names, axes, words, known.COVARIANCES))
+
+
+def _stated(
+    names: Sequence[str], axes: Sequence[str], words: Sequence[Sequence[str]], spellings: Sequence[str]
+) -> Iterator[Entries]:
+    """What states the covariance of a state, the likelier first; at last what there is, which may be nothing.
+
+    Parameters
+    ----------
+    words : for the components, in other spellings than those of docs/files.md
+    """
+    n = len(axes)
     exact = {name: place for place, name in enumerate(names)}
     once = places_of(names)
-    diagonal = {(i, i) for i in range(len(axes))}
     own = _entries(exact, axes, "P_{}_{}")
     if is_pose(axes):
         own = _entries(exact, "xyh", "P_{}{}") | own
-    if diagonal <= set(own):
-        return Entries(own)
+    if _diagonal(n) <= set(own):
+        yield Entries(own)
     if not own and (deviations := alike(exact, axes, known.DEVIATIONS)):
-        return Entries(_diagonal(deviations), squared=False)
-    labels = _state_labels(axes)
+        yield Entries(_by_pairs(deviations), squared=False)
     best: dict[tuple[int, int], int] = {}
-    for words, spelling in itertools.product(labels, known.COVARIANCES):
-        found = _entries(once, words, spelling)
-        for i, word in enumerate(words):
-            for place in alike(once, [word], known.VARIANCES):
-                found.setdefault((i, i), place)
-        if diagonal <= set(found) and len(found) > len(best):
-            best = found
-    if best:
-        return Entries(best, renamed=True)
-    for words in labels:
-        if not own and (deviations := alike(once, words, known.DEVIATIONS)):
-            return Entries(_diagonal(deviations), squared=False, renamed=True)
-    return Entries(own)
+    for labels in words:
+        variances = _variances(once, labels)
+        for spelling in spellings:
+            if not variances and spelling.format(labels[0], labels[0]) not in once:
+                continue
+            found = {**variances, **_entries(once, labels, spelling)}
+            if _diagonal(n) <= set(found) and len(found) > len(best):
+                best = found
+    if len(best) > n:
+        yield Entries(best, renamed=True)
+    for labels in words:
+        if not own and (deviations := alike(once, labels, known.DEVIATIONS)):
+            yield Entries(_by_pairs(deviations), squared=False, renamed=True)
+    yield Entries(best or own, renamed=bool(best))
 
 
-def _diagonal(places: Sequence[int]) -> dict[tuple[int, int], int]:
+def _diagonal(n: int) -> set[tuple[int, int]]:
+    return {(i, i) for i in range(n)}
+
+
+def _variances(once: Mapping[str, int], labels: Sequence[str]) -> dict[tuple[int, int], int]:
+    """Places of variances under names of their own, by row and column."""
+    found = {}
+    for i, label in enumerate(labels):
+        for place in alike(once, [label], known.VARIANCES):
+            found[i, i] = place
+    return found
+
+
+def _by_pairs(places: Sequence[int]) -> dict[tuple[int, int], int]:
+    """Places of components by themselves, by row and column."""
     return {(i, i): place for i, place in enumerate(places)}
 
 
@@ -131,16 +171,6 @@ def _entries(places: Mapping[str, int], words: Sequence[str], spelling: str) -> 
         if name in places:
             found[i, j] = places[name]
     return found
-
-
-def _state_labels(axes: Sequence[str]) -> list[tuple[str, ...]]:
-    """Words for the components in names of a covariance: their own, or numbers from 1 or 0 on."""
-    labels = [tuple(plain_names(axes))]
-    if is_pose(labels[0]):
-        labels = [("x", "y", heading) for heading in (*known.HEADINGS, *known.SHORT_HEADINGS)]
-    for first in (1, 0):
-        labels.append(tuple(map(str, range(first, first + len(axes)))))
-    return labels
 
 
 # --- poses in space ----------------------------------------------------------------------------------
@@ -218,11 +248,8 @@ def _pose_columns(names: Sequence[str], where: Path) -> PoseColumns | None:
         rest = moving[0]
         if all(moving):
             rest = tuple(itertools.chain.from_iterable(moving))
-    covariance = _pose_covariance(plain, once, len(rest))
-    variances: tuple[int, ...] = ()
-    if not covariance:
-        variances = _each_alone(once, len(rest), known.VARIANCES)
-    return PoseColumns(clock, position, quaternion, covariance or variances, kind, rest, bool(variances))
+    covariance, squared = _pose_covariance(names, len(rest))
+    return PoseColumns(clock, position, quaternion, covariance, kind, rest, squared)
 
 
 def _family(plain: Sequence[str], spellings: Sequence[str], parts: str, where: Path) -> tuple[int, ...]:
@@ -248,55 +275,40 @@ def _places_like(plain: Sequence[str], name: str, in_longer: bool) -> list[int]:
     return [place for place, other in enumerate(plain) if other.endswith(f"_{name}")]
 
 
-def _pose_covariance(plain: Sequence[str], once: Mapping[str, int], rest: int) -> tuple[int, ...]:
-    """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one."""
-    for labels, spelling in itertools.product(_pose_labels(rest), (*known.COVARIANCES, known.CNSPY)):
-        if found := _triangle(once, labels, spelling):
-            return found
-    rotation = _triangle(once, "rpy", "q{}{}")
-    position = _triangle(once, "xyz", "p{}{}")
-    if rotation and position:
-        return rotation + position
-    return _each_alone(once, rest, known.DEVIATIONS) or _numbered(plain, rest)
+def _pose_covariance(names: Sequence[str], rest: int) -> tuple[tuple[int, ...], bool]:
+    """Places of the columns of a covariance of a pose and ``rest`` more, or of the pose alone; none without one.
+
+    Also whether they are variances alone.
+    """
+    spellings = (*known.COVARIANCES, known.CNSPY)
+    for n in sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True):
+        words = [(*labels, *known.MOVING_LABELS[: n - 6]) for labels in known.LABELS]
+        variances: tuple[int, ...] = ()
+        for found in _stated(names, words[0], words, spellings):
+            places = found.in_order(n)
+            if found.squared and len(places) == n:
+                variances = places
+            elif places:
+                return places, False
+        if places := _numbered(names, n):
+            return places, False
+        if variances:
+            return variances, True
+    once = places_of(names)
+    rotation = Entries(_entries(once, "rpy", "q{}{}")).in_order(3)
+    position = Entries(_entries(once, "xyz", "p{}{}")).in_order(3)
+    return (rotation + position if rotation and position else ()), False
 
 
-def _sizes(rest: int) -> list[int]:
-    """Numbers of components that a covariance of a pose and ``rest`` more may have, the largest first."""
-    return sorted({6, 6 + min(rest, 3), 6 + rest}, reverse=True)
-
-
-def _pose_labels(rest: int) -> list[tuple[str, ...]]:
-    """Words for the components of a pose and ``rest`` more."""
-    return [(*labels, *known.MOVING_LABELS[: n - 6]) for n in _sizes(rest) for labels in known.LABELS]
-
-
-def _each_alone(once: Mapping[str, int], rest: int, spellings: Sequence[str]) -> tuple[int, ...]:
-    """Places of the standard deviations, or variances, of all components; none without them."""
-    found = (alike(once, labels, spellings) for labels in _pose_labels(rest))
-    return next(filter(None, found), ())
-
-
-def _triangle(once: Mapping[str, int], labels: Sequence[str], spelling: str) -> tuple[int, ...]:
-    """Places of the entries of an upper triangle, or of their mirror images; none where one is not there."""
-    found = []
-    for a, b in itertools.combinations_with_replacement(labels, 2):
-        place = once.get(spelling.format(a, b), once.get(spelling.format(b, a)))
-        if place is None:
-            return ()
-        found.append(place)
-    return tuple(found)
-
-
-def _numbered(plain: Sequence[str], rest: int) -> tuple[int, ...]:
-    """Places of numbered columns of a covariance, all of them or those of its upper triangle; none without them."""
-    sizes = [size for n in _sizes(rest) for size in (n * n, n * (n + 1) // 2)]
+def _numbered(names: Sequence[str], n: int) -> tuple[int, ...]:
+    """Places of numbered columns of a covariance, all n^2 of them or its upper triangle; none without them."""
     stated: dict[str, dict[tuple[int, int], int]] = {}
-    for place, name in enumerate(plain):
+    for place, name in enumerate(plain_names(names)):
         number = known.NUMBERED.fullmatch(name)
         if number and "twist" not in number[1]:
             stated.setdefault(number[1], {})[int(number[2]), int(number[3] or -1)] = place
     for places in stated.values():
-        if len(places) in sizes:
+        if len(places) in (n * n, n * (n + 1) // 2):
             return tuple(places[key] for key in sorted(places))
     return ()
 

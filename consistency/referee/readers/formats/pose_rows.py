@@ -93,7 +93,8 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
         )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": heading}
+    t, x, y = lines.values[:, :3].T
+    columns = {"t": t, "x": x, "y": y, "heading": heading}
     return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
 
 
@@ -122,7 +123,8 @@ def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Colu
     pose = numbers(found.position + found.quaternion)
     values = np.column_stack([t, *pose, *stated])
     note = _named_note(path, head, found, true, UNIT_NAMES[unit])
-    return increasing(Lines(path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut))
+    lines = Lines(path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut)
+    return increasing(lines)
 
 
 def _named_note(path: Path, head: Head, found: PoseColumns, true: bool, clock: str) -> str:

@@ -55,7 +55,7 @@ def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
     return f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
 
 
-def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Poses:
+def point_positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Poses:
     """Estimated positions p + R l of a point of the body beside its true ones, with their covariances to first order.
 
     Parameters

@@ -165,9 +165,13 @@ def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:
 
 def _numbers(path: Path, first: int, run: int, r: Reading) -> TextFile | None:
     """A file of numbers without names, whose covariances begin in column ``first``."""
+    width = 0
     with opened(path) as file:
-        rows = (line for raw in file if (line := raw.decode("utf-8-sig").strip()) and not line.startswith("#"))
-        width = len(fields_of(next(rows, "")))
+        for raw in file:
+            line = raw.decode("utf-8-sig").strip()
+            if line and not line.startswith("#"):
+                width = len(fields_of(line))
+                break
     many = width - first
     if many not in (6, TRIANGLE, FULL):
         return None

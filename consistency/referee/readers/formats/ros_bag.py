@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.pose_covariances import require_spatial
 from consistency.referee.readers.formats.pose_rows import FULL, POSE
 from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.text_blocks import Lines
-from consistency.referee.readers.formats.tum import SpaceRun, poses_of, space_estimator
+from consistency.referee.readers.formats.tum import SpaceRun, poses_without_covariances, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
 from consistency.referee.readers.windows import MARGINAL
@@ -61,7 +61,7 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     if not is_one_bag(path):
         bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
-        return [poses_of(path, [_bare_run(bag, r) for bag in bags], r)]
+        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in bags], r)]
     if r.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
     require_spatial(r.error, SPATIAL)
@@ -136,7 +136,7 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
     InputError
         None is stated.
     """
-    variances = np.concatenate([np.diagonal(one.covariance, axis1=1, axis2=2) for one in poses])
+    variances = np.concatenate([one.variances for one in poses])
     none = np.isnan(variances).all(axis=0)
     none |= (variances == 0).all(axis=0)
     none |= (variances >= ENDLESS).all(axis=0)

@@ -102,7 +102,8 @@ class TableRows(FileRows):
 
     def rows(self, keep: Array) -> TableRows:
         """Some of the rows."""
-        return replace(self, data={name: cells[keep] for name, cells in self.data.items()}, line=self.line[keep])
+        data = {name: cells[keep] for name, cells in self.data.items()}
+        return replace(self, data=data, line=self.line[keep])
 
     def renamed(self, columns: Columns | None) -> TableRows:
         """The table with names of ``columns`` in place of its own."""
@@ -323,7 +324,9 @@ def _joined(parts: list[Column]) -> Column:
         return np.concatenate(parts)
     as_objects = []
     for part in parts:
-        as_objects.append(part if part.dtype.kind == "O" else np.where(np.isnan(part), np.array(None), part))
+        if part.dtype.kind != "O":
+            part = np.where(np.isnan(part), np.array(None), part)
+        as_objects.append(part)
     return np.concatenate(as_objects)
 
 

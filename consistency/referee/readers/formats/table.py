@@ -64,7 +64,8 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
             found.append(_innovations(name, own, key, axes))
         else:
             found.append(_estimator(name, own, true, key, axes, convention, r, poses_alone))
-    return [replace(found[0], notes=(*notes, *found[0].notes)), *found[1:]]
+    first = found[0]
+    return [replace(first, notes=(*notes, *first.notes)), *found[1:]]
 
 
 def _both(
@@ -244,7 +245,7 @@ def _estimator(
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])
     if r.relative is not None and not r.motions:
-        cross = columns.cross_covariances(sheet)
+        cross = columns.stated_cross_covariances(sheet)
     if r.truth_covariance is not None:
         of_truth = columns.stated_covariance(truth, axes, covariance_columns(list(truth.data), axes))
     estimate = sheet.matrix(axes)
@@ -294,7 +295,8 @@ def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
         if "run" in sheet:
             name = f"run {run}"
         one = poses.of_rows(rows)
-        found.append(replace(one, run=int(run), name=name, open_end=sheet.open_end(int(rows[-1]))))
+        open_end = sheet.open_end(int(rows[-1]))
+        found.append(replace(one, run=int(run), name=name, open_end=open_end))
     return found
 
 

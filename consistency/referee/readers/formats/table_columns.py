@@ -153,7 +153,8 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     order = np.lexsort((values, runs))
     if key == "t":
         order = np.argsort(runs, kind="stable")
-    stuck = np.flatnonzero((np.diff(runs[order]) == 0) & (np.diff(values[order]) <= 0))
+    is_stuck = (np.diff(runs[order]) == 0) & (np.diff(values[order]) <= 0)
+    stuck = np.flatnonzero(is_stuck)
     if not len(stuck):
         return order
     before, row = order[stuck[0] : stuck[0] + 2]
@@ -219,7 +220,7 @@ def own_covariance(sheet: TableRows) -> Array | None:
     return out
 
 
-def cross_covariances(sheet: TableRows) -> Array | None:
+def stated_cross_covariances(sheet: TableRows) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
     columns = []
     missing = []

@@ -204,7 +204,8 @@ class Lines(FileRows):
         """The lines without the last one if it alone is ``bad``, (N,) of bool, and has no end."""
         if not self.open_line or len(bad) < 2 or not bad[-1] or bad[:-1].any():
             return self
-        return replace(self.rows(slice(-1)), open_line=0, cut=cut_note(self.path, self.open_line))
+        note = cut_note(self.path, self.open_line)
+        return replace(self.rows(slice(-1)), open_line=0, cut=note)
 
 
 def bounded(values: Array) -> Array:

@@ -32,8 +32,8 @@ from consistency.referee.readers.formats.pose_rows import (
 from consistency.referee.readers.formats.position_truth import (
     fixed,
     placeholder,
+    point_positions,
     position_note,
-    positions,
     require_positions,
 )
 from consistency.referee.readers.formats.rotations import not_unit
@@ -89,7 +89,7 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
     runs = (_run_of(own, true, P, truth_of, r) for own, true, P in files)
-    return [poses_of(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
+    return [poses_without_covariances(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
 
 
 def _run_of(own: Path, true: Path, covariance: Path | None, truth_of: Callable[[Path], Lines], r: Reading) -> SpaceRun:
@@ -135,7 +135,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         if what:
             notes.append(f"{layout.files[1]}: {what}")
         if is_empty:
-            poses = [positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
+            poses = [point_positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
         require_positions(path, poses, r)
     elif r.lever_arm is not None:
@@ -207,7 +207,7 @@ def _origin(stated: Stated) -> str:
     return OPENVINS
 
 
-def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
+def poses_without_covariances(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
     """Poses in space without their covariances.
 
     Raises
@@ -242,7 +242,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     poses = _poses(run, k, P, known, layout.convention, r)
     poses = replace(poses, cross=cross, true_covariance=of_truth)
     if _is_point(true):
-        poses = positions(poses, r.lever_arm, layout.stated != WHOLE)
+        poses = point_positions(poses, r.lever_arm, layout.stated != WHOLE)
     return poses, note
 
 

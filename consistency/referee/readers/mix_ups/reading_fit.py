@@ -317,7 +317,7 @@ def is_same(runs: Sequence[Poses]) -> bool:
         p = p.matched()
         error = np.abs(p.errors())
         with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+            sigma = np.sqrt(p.variances)
             equal = (error <= rounding) & (error <= NEGLIGIBLE * sigma)
         same += int(equal.all(axis=1).sum())
         total += len(error)

@@ -106,7 +106,8 @@ def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
 def _some(count: int, parts: int = 1) -> Indices:
     """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
     most = max(ENOUGH // parts, 2)
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
+    places = np.linspace(0, max(count - 1, 0), min(count, most))
+    return np.unique(places.astype(np.int64))
 
 
 def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
@@ -127,7 +128,8 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record
-    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
+    some = _some(int(counted.sum()))
+    run, step = (places[some] for places in np.nonzero(counted))
     error = None
     if record.error is not None:
         error = record.error[run, step]
@@ -138,7 +140,8 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
             "only called so"
         )
     try:
-        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
+        bins = BINS if r.bins is None else r.bins
+        groups = groups_of(replace(column, values=record.by), bins, counted)
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
@@ -156,7 +159,8 @@ def record_in_groups(record: Record, r: Reading) -> Record:
     cells = record.by
     if r.by_file is not None:
         sheet = _sheet(r)
-        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
+        of_runs = [_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers]
+        cells = np.stack(of_runs)
     if cells is None:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
     return _by_cells(record, r.by, cells, r)

@@ -93,7 +93,7 @@ def _judged(e: Estimator, r: Reading) -> list[int]:
     else:
         judged = list(range(len(e.axes)))
     if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
-        stated = np.any([_variances(p).any(axis=0) for p in e.runs], axis=0)
+        stated = np.any([p.variances.any(axis=0) for p in e.runs], axis=0)
         judged = [i for i in judged if i < len(AXES) or stated[i]]
     return judged
 
@@ -258,15 +258,11 @@ def _space_notes(e: Estimator, pairs: Sequence[Poses], errors: Sequence[Array]) 
 def _bent(p: Poses) -> Array:
     """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
     assert p.bend is not None
-    sigma = np.sqrt(np.abs(_variances(p)[:, :3]).mean(axis=1))
+    sigma = np.sqrt(np.abs(p.variances[:, :3]).mean(axis=1))
     bent = np.zeros(len(sigma))
     some = (sigma > 0) & (p.bend > 1e-9)
     bent[some] = p.bend[some] / sigma[some]
     return bent
-
-
-def _variances(p: Poses) -> Array:
-    return np.diagonal(p.covariance, axis1=1, axis2=2)
 
 
 def _largest_median(of_runs: Iterable[Array]) -> float:

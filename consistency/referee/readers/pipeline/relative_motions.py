@@ -63,7 +63,8 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
         raise InputError(f"{file}: --relative: {MARGINAL}")
     known = p.known()
     t = p.seconds
-    first, last, left_out = windows(t, known.truth[:, : p.d], known.rows, relative, file)
+    position = known.truth[:, : p.d]
+    first, last, left_out = windows(t, position, known.rows, relative, file)
     sound = _sound(p, relative)
     whole = last < sound
     first = first[whole]

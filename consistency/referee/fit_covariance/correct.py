@@ -273,7 +273,7 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
     for number, name in enumerate(names):
         of_group = np.where(group_index(record) == number, nees, np.nan)
         some = replace(record, nees=of_group, groups=None)
-        there = np.isfinite(of_group).any(axis=1)
+        there = np.asarray(np.isfinite(of_group).any(axis=1))
         if there.sum() < 2:
             fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
             continue

@@ -106,7 +106,7 @@ def test_right_maps_are_found_at_fault_no_more_often_than_stated():
         ("a landmark", "overconfident", "landmark 21"),
         ("conservative", "conservative", "too large by x2."),
         ("bias", "biased", "sigma"),
-        ("tails", "heavy-tailed", "from the other runs in run 3"),
+        ("tails", "heavy-tailed", "outlier in run 3, "),
     ],
 )
 def test_what_is_wrong_is_named(spoil, status, words):

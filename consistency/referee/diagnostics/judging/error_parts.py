@@ -253,7 +253,7 @@ def shape_of(sample: Sample, tests: Tests, faults: set[str], false_alarm: float)
     """The two axes that are correlated least as stated: over whole runs, or in the step where a fault was found.
 
     A pair whose correlation is itself shown to be wrong (:func:`_shown_pairs`) comes before the others, and among these
-    one of the wrong sign. Only such a pair can make a verdict *inconsistent*: by chance in none of 576 simulated data
+    one of the wrong sign. Only such a pair can make a verdict *inconsistent*: by chance in none of 1,152 simulated data
     sets where the factor of one axis or one block alone is wrong.
     """
     if tests.matrix is None or sample.dof == 1:

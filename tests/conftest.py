@@ -1,11 +1,6 @@
 """Small worlds that many tests share, tiers, and settings of the property tests."""
 
-from __future__ import annotations
-
 import gc
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +9,6 @@ from hypothesis import settings
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import jit
-from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import TrialWork
 
 gc.set_threshold(100_000, 20, 100)  # what is collected lives to the end
@@ -42,18 +36,18 @@ LONGER = {
 TILTED = {"position": [0.12, -0.05, 0.3], "rotation": [0.08, -0.15, 0.4]}  # m; roll, pitch, heading in rad
 
 
-def is_quick(path: Path) -> bool:
+def is_quick(path):
     return {"unit", "referee"} & {*path.parts} != set() and path.stem.removeprefix("test_") not in LONGER
 
 
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+def pytest_ignore_collect(collection_path, config):
     """``-m quick`` need not import the others."""
     asked = config.option.markexpr == "quick" and collection_path.suffix == ".py"
     return True if asked and not is_quick(collection_path) else None
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Mark what is quick; files with slow tests come first, so that workers end together."""
     slow = {item.path for item in items if item.get_closest_marker("slow") or item.get_closest_marker("browser")}
     for item in items:
@@ -63,7 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+def pytest_runtest_protocol(item):
     """Quick tests and their fixtures are refused a kernel."""
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("quick"):
@@ -71,43 +65,43 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         return (yield)
 
 
-def refuse(*_: Any) -> None:
+def refuse(*_):
     pytest.fail("a test that runs a kernel is not quick: its file belongs among LONGER of tests/conftest.py")
 
 
 @pytest.fixture(scope="session")
-def small() -> Callable[..., cs.Scenario]:
+def small():
     """``small("herath2007-xyz", key=value)``: a built-in world cut to 60 steps, with changes."""
 
-    def make(name: str, **changes: Any) -> cs.Scenario:
+    def make(name, **changes):
         return cs.load_scenario(name).variant(f"small-{name}", **{"truth__steps": 60, **changes})
 
     return make
 
 
 @pytest.fixture(scope="session")
-def xyz(small: Callable[..., cs.Scenario]) -> cs.Scenario:
+def xyz(small):
     return small("herath2007-xyz")
 
 
 @pytest.fixture(scope="session")
-def uvd(small: Callable[..., cs.Scenario]) -> cs.Scenario:
+def uvd(small):
     return small("herath2007-stereo")
 
 
 @pytest.fixture(scope="session")
-def linear(small: Callable[..., cs.Scenario]) -> cs.Scenario:
+def linear(small):
     return small("linear-gaussian")
 
 
 @pytest.fixture(scope="session")
-def tilted() -> dict[str, list[float]]:
+def tilted():
     """A mount with every number different from zero."""
     return TILTED
 
 
 @pytest.fixture(scope="module")
-def dense() -> Iterator[None]:
+def dense():
     """Kernels without local updating, which small worlds do not come to and which takes longer to compile."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Compiled, "local_from", 10**9)
@@ -115,13 +109,13 @@ def dense() -> Iterator[None]:
 
 
 @pytest.fixture
-def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], list[int]]:
+def stop_at(monkeypatch):
     """Has an error raised in the place of a run; gives the list of the runs that are done."""
 
-    def arm(run: int, error: BaseException) -> list[int]:
+    def arm(run, error):
         one, done = TrialWork.__call__, list[int]()
 
-        def stopped(self: TrialWork, number: int) -> RunOutcome:
+        def stopped(self, number):
             if number == run:
                 raise error
             done.append(number)
@@ -134,12 +128,12 @@ def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, BaseException], l
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
+def rng():
     return np.random.default_rng(20070)
 
 
 @pytest.fixture
-def fresh() -> np.random.Generator:
+def fresh():
     """Numbers that no other run of the test has; the seed is printed where it fails."""
     seed = np.random.SeedSequence().entropy
     print(f"seed {seed}")

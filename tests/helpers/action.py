@@ -1,21 +1,18 @@
 """The file of the GitHub Action, and whether steps that use it give inputs that it has."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import yaml
 from documents import ROOT
 
 FOLDER = ROOT / ".github/actions/consistency"
-FILE: dict[str, Any] = yaml.safe_load((FOLDER / "action.yml").read_text())
-STEPS: list[dict[str, Any]] = FILE["runs"]["steps"]
+FILE = yaml.safe_load((FOLDER / "action.yml").read_text())
+STEPS = FILE["runs"]["steps"]
 STEP_KEYS = {"name", "id", "if", "shell", "run", "uses", "with", "env", "working-directory", "continue-on-error"}
 ACTION = re.compile(r"(\.|OWNER/filter-consistency)/\.github/actions/consistency(@VERSION)?")
 
 
-def require_uses(text: str) -> list[dict[str, Any]]:
+def require_uses(text):
     """The steps of a workflow, or of a part of one, that use the action; there must be one.
 
     Raises

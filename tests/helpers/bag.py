@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
@@ -30,7 +28,7 @@ class Track(Protocol):
 
 
 @cache
-def types_of(ros: int) -> Any:
+def types_of(ros):
     """The types of ROS 1 or 2, which compile on first use."""
     if ros == 2:
         return get_typestore(Stores.ROS2_HUMBLE)
@@ -39,17 +37,17 @@ def types_of(ros: int) -> Any:
     return store
 
 
-def messages(store: Any, kind: str, drive: Track, ros1: bool) -> Iterator[tuple[str, str, int, Any]]:
+def messages(store, kind, drive, ros1):
     """Topic, type, time of writing and message; the stamps are those of the drive, the times a little later."""
     T = store.types
 
-    def header(t: float, frame: str) -> Any:
+    def header(t, frame):
         ns = START * 10**9 + round(t * 1e9)
         stamp = T["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
         extra = {"seq": 0} if ros1 else {}
         return T["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
 
-    def pose(values: Array) -> Any:
+    def pose(values):
         point = T["geometry_msgs/msg/Point"](*map(float, values[:3]))
         return T["geometry_msgs/msg/Pose"](point, T["geometry_msgs/msg/Quaternion"](*map(float, values[3:])))
 
@@ -75,16 +73,16 @@ def messages(store: Any, kind: str, drive: Track, ros1: bool) -> Iterator[tuple[
             yield "/vicon", name, late(t), T[name](header(t, "map"), pose(values))
 
 
-def late(t: float) -> int:
+def late(t):
     return START * 10**9 + round((t + 0.3) * 1e9)
 
 
-def write(path: Path, ros: int, kind: str, drive: Track, suffix: str = ".db3") -> Path:
+def write(path, ros, kind, drive, suffix=".db3"):
     """A bag of ROS 1, or the folder of one of ROS 2, with /odom and /tf ("odometry") or /pose and /vicon ("pose")."""
     store = types_of(ros)
     writer = Writer1(path) if ros == 1 else Writer2(path, version=9, storage_plugin=STORAGE[suffix])
     with writer:
-        connections: dict[str, Any] = {}
+        connections = {}
         for topic, name, at, message in messages(store, kind, drive, ros == 1):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, name, typestore=store)
@@ -93,7 +91,7 @@ def write(path: Path, ros: int, kind: str, drive: Track, suffix: str = ".db3") -
     return path
 
 
-def write_fixes(path: Path, kind: int, own: Array, true: Array, C: Array, body: str = "gps", status: int = 0) -> Path:
+def write_fixes(path, kind, own, true, C, body="gps", status=0):
     """Fixes on /fix with covariances C (N, 3, 3), true ones on /rtk, at 10 Hz; the second of /fix has ``status``."""
     store = types_of(1)
     T = store.types

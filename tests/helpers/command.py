@@ -1,15 +1,11 @@
 """Commands run in the process of the tests."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from consistency.commands import main
 
 
-def consistency(capsys: pytest.CaptureFixture[str], *words: str | Path, status: int = 0) -> tuple[str, str]:
+def consistency(capsys, *words, status=0):
     """Standard output and error of a command that has to end with ``status``."""
     with pytest.raises(SystemExit) as end:
         main([*map(str, words)])
@@ -18,7 +14,7 @@ def consistency(capsys: pytest.CaptureFixture[str], *words: str | Path, status: 
     return out, err
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+def refused(capsys, *words):
     """The one line that a command ends with whose input cannot be used."""
     out, err = consistency(capsys, *words, status=2)
     assert (out, err.count("\n")) == ("", 1), err

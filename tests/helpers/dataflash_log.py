@@ -1,11 +1,6 @@
 """A small DataFlash log of ArduPilot, written message by message with pymavlink, for the tests to read."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 from pymavlink.DFReader import DFFormat, DFMessage
 
@@ -23,7 +18,7 @@ DECLARED = {
 class Flight:
     """A log in the making."""
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names):
         self.body = b""
         self.formats = {name: self._format(name, *DECLARED[name]) for name in ("FMT", "PARM", *names)}
         for each in self.formats.values():
@@ -31,12 +26,12 @@ class Flight:
             self.body += DFMessage(self.formats["FMT"], list(values), False, None).get_msgbuf()
 
     @staticmethod
-    def _format(name: str, number: int, types: str, columns: str) -> Any:
+    def _format(name, number, types, columns):
         return DFFormat(
             number, name, 3 + struct.calcsize(DFFormat(number, name, 0, types, columns).msg_struct), types, columns
         )
 
-    def log(self, name: str, stamp: int, values: Mapping[str, float | bytes]) -> None:
+    def log(self, name, stamp, values):
         """One message; fields that are not given are zero."""
         form = self.formats[name]
         raw = [
@@ -46,11 +41,11 @@ class Flight:
         raw = [round(100 * v) if kind == "c" else v for v, kind in zip(raw, form.format, strict=True)]
         self.body += DFMessage(form, raw, True, None).get_msgbuf()
 
-    def set(self, gates: Mapping[str, float]) -> Flight:
+    def set(self, gates):
         for name, value in gates.items():
             self.log("PARM", 0, {"Name": name.encode(), "Value": value})
         return self
 
-    def write(self, path: Path) -> Path:
+    def write(self, path):
         path.write_bytes(self.body)
         return path

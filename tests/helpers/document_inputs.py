@@ -1,12 +1,7 @@
 """What the commands and the code of the documents find in their folder, and which of them are not run here."""
 
-from __future__ import annotations
-
 import csv
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from documents import ROOT
@@ -14,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.bench.runs.montecarlo import simulate_log
-from consistency.referee.types import Array
 
 RNG = np.random.default_rng(20070)  # what is judged right or wrong is not asserted
 DT, STEPS, RUNS = 0.5, 120, 12
@@ -66,32 +60,32 @@ NOT_RUN = [
 ]  # fmt: skip
 
 
-def not_run(page: str, text: str) -> bool:
+def not_run(page, text):
     return any(page == where and text.startswith(begin) for where, begin, _ in NOT_RUN)
 
 
 # --- files -------------------------------------------------------------------------------------------------
 
 
-def write_rows(at: Path, *columns: Array) -> None:
+def write_rows(at, *columns):
     at.parent.mkdir(exist_ok=True, parents=True)
     np.savetxt(at, np.column_stack([T, *columns]), fmt="%.12g")
 
 
-def poses(place: Array, turn: Rotation) -> Array:
+def poses(place, turn):
     return np.column_stack([place, turn.as_quat()])
 
 
-def errors() -> Array:
+def errors():
     return SIGMA * RNG.normal(size=(STEPS, 6))
 
 
-def estimated() -> Array:
+def estimated():
     e = errors()
     return poses(PLACE - e[:, :3], Rotation.from_rotvec(-e[:, 3:]) * TURN)
 
 
-def trajectories(folder: Path) -> None:
+def trajectories(folder):
     """est, truth and P as folders of RUNS files, and est.txt, truth.txt, P.txt of one run."""
     for name in ["", *(f"/{k:02d}" for k in range(RUNS))]:
         write_rows(folder / f"truth{name}.txt", poses(PLACE, TURN))
@@ -99,7 +93,7 @@ def trajectories(folder: Path) -> None:
         write_rows(folder / f"P{name}.txt", P)
 
 
-def inline(folder: Path) -> None:
+def inline(folder):
     """Covariances in the lines of poses: est.txt, the folders est, NEW and OLD, and rtk.txt; TRUTH as truth."""
     trajectories(folder)
     for name in ("est.txt", *(f"{of}/{k:02d}.txt" for of in ("est", "NEW", "OLD") for k in range(RUNS))):
@@ -108,7 +102,7 @@ def inline(folder: Path) -> None:
     write_rows(folder / "rtk.txt", poses(PLACE, TURN), 0.1 * P)
 
 
-def motions(folder: Path) -> None:
+def motions(folder):
     """motions.tum, each line a motion with its covariance, and truth.tum."""
     write_rows(folder / "truth.tum", poses(PLACE, TURN))
     before = TURN[:-1].inv()
@@ -117,7 +111,7 @@ def motions(folder: Path) -> None:
     write_rows(folder / "motions.tum", np.vstack([[0, 0, 0, 0, 0, 0, 1], moved]), P)
 
 
-def table(at: Path, rows: list[dict[str, float]]) -> None:
+def table(at, rows):
     at.parent.mkdir(exist_ok=True, parents=True)
     with at.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -125,7 +119,7 @@ def table(at: Path, rows: list[dict[str, float]]) -> None:
         writer.writerows(rows)
 
 
-def planar(folder: Path, steps: int = 20) -> None:
+def planar(folder, steps=20):
     """poses.csv and truth.csv: x, y, heading of 30 runs."""
     rng, sigma = RNG, np.array([0.1, 0.1, 0.02])
     variances = dict(zip(("P_xx", "P_yy", "P_hh"), sigma**2, strict=True)) | dict.fromkeys(
@@ -138,19 +132,19 @@ def planar(folder: Path, steps: int = 20) -> None:
     table(folder / "truth.csv", [key | dict.fromkeys(names, 0.0) for key in keys])
 
 
-def grouped(folder: Path) -> None:
+def grouped(folder):
     """est.csv with columns to group by, and truth.csv; est.txt, truth.txt, P.txt with a table beside them."""
     trajectories(folder)
     planar(folder)
     with (folder / "poses.csv").open(newline="") as file:
-        rows: list[dict[str, Any]] = list(csv.DictReader(file))
+        rows = list(csv.DictReader(file))
     for k, row in enumerate(rows):
         row |= {"n_matches": 10 * (k % 20), "weather": ("sun", "rain")[k % 2]}
     table(folder / "est.csv", rows)
     table(folder / "matches.csv", [{"t": t, "n_matches": 10 * (k % 20)} for k, t in enumerate(T.tolist())])
 
 
-def started(folder: Path) -> None:
+def started(folder):
     """est.csv, new.csv and old.csv of one truth.csv, and a folder of results."""
     planar(folder, 60)
     for name in ("est.csv", "new.csv", "old.csv"):
@@ -158,7 +152,7 @@ def started(folder: Path) -> None:
     results("results")(folder)
 
 
-def kitti(folder: Path) -> None:
+def kitti(folder):
     """A drive as truth, and estimates at the first pose all the time."""
     import drives
 
@@ -175,7 +169,7 @@ def kitti(folder: Path) -> None:
     table(folder / "est.csv", [{"t": 0.103 * k, **zero} for k in range(50)])
 
 
-def openvins(folder: Path) -> None:
+def openvins(folder):
     import drives
 
     drives.write_states(folder)
@@ -185,7 +179,7 @@ def openvins(folder: Path) -> None:
     write_rows(folder / "stamped_groundtruth.txt", poses(PLACE, TURN))
 
 
-def moving(folder: Path) -> None:
+def moving(folder):
     """states.csv with a covariance 15 wide, and data.csv, the truth of EuRoC, in s."""
     rest = np.zeros((STEPS, 9))
     own, sigma = np.hstack([estimated(), rest + 0.01 * RNG.normal(size=(STEPS, 9))]), np.append(SIGMA, np.full(9, 0.01))
@@ -198,7 +192,7 @@ def moving(folder: Path) -> None:
     np.savetxt(folder / "data.csv", true, delimiter=",", fmt="%.12g")
 
 
-def innovations(folder: Path) -> None:
+def innovations(folder):
     import dataflash_log
     import flight
 
@@ -215,7 +209,7 @@ def innovations(folder: Path) -> None:
     ratios.write(folder / "flight.bin")
 
 
-def images(folder: Path) -> None:
+def images(folder):
     """IMAGES: a KITTI sequence of a wall; RESTING: the same pair again and again; FILE: their calibration."""
     import cv2
     import scene
@@ -231,7 +225,7 @@ def images(folder: Path) -> None:
     shutil.copy(folder / "IMAGES/calib.txt", folder / "FILE")
 
 
-def boards(folder: Path, square: float = 0.024) -> None:
+def boards(folder, square=0.024):
     """BOARDS: pairs left1, right1, ... of a chessboard of 9 x 6 inner corners in several poses."""
     import cv2
 
@@ -252,16 +246,16 @@ def boards(folder: Path, square: float = 0.024) -> None:
             assert cv2.imwrite(str(folder / f"BOARDS/{side}{k}.png"), np.clip(view, 0, 255).astype(np.uint8))
 
 
-def log(name: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
+def log(name):
+    def write(folder):
         simulate_log(cs.load_scenario("herath2007-stereo"), 4, 11, folder / name)
         shutil.copy(folder / name / "sensor.toml", folder / "sensor.toml")
 
     return write
 
 
-def results(*names: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
+def results(*names):
+    def write(folder):
         world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=60)
         done = cs.run_trials(world, ["ekf-uvd", "ukf-uvd"], runs=20, seed=5, jobs=1)
         for name in names:
@@ -270,19 +264,19 @@ def results(*names: str) -> Callable[[Path], None]:
     return write
 
 
-def repository(folder: Path) -> None:
+def repository(folder):
     shutil.copytree(ROOT / "docs/examples/repository", folder, dirs_exist_ok=True)
 
 
-def in_checkout(folder: Path) -> None:
+def in_checkout(folder):
     shutil.copytree(ROOT / "docs/examples/repository", folder / "docs/examples/repository")
 
 
-def case_studies(folder: Path) -> None:
+def case_studies(folder):
     shutil.copytree(ROOT / "docs/case-studies", folder / "docs/case-studies")
 
 
-PREPARE: dict[str, list[Callable[[Path], None]]] = {
+PREPARE = {
     "README.md": [in_checkout],
     "docs/case-studies.md": [case_studies],
     "docs/characterise.md": [log("drive"), images, boards],
@@ -326,7 +320,7 @@ def simulate_my_filter(runs):
 """
 
 
-def names_of(page: str, folder: Path) -> dict[str, Any]:
+def names_of(page, folder):
     """Variables that the code of a page does not make itself."""
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
@@ -359,10 +353,10 @@ class Wrapped:
 
     name, sensors = "mine", ("uvd",)
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.inner = cs.get_filter("ekf-uvd")
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         if name in ("init", "predict", "update", "pose"):
             return getattr(self.inner, name)
         raise AttributeError(name)

@@ -10,7 +10,6 @@ import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = (
@@ -43,7 +42,7 @@ class Block:
     before: str  # the paragraph above it
     part: str = ""  # the heading of the second level above it
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.page}:{self.line}"
 
 
@@ -54,16 +53,16 @@ class Command:
     text: str  # on one line, without its comment
     inline: bool = False  # in a sentence, which may leave out what is required
 
-    def __str__(self) -> str:
+    def __str__(self):
         return f"{self.page}:{self.line} {self.text}"
 
     @property
-    def synopsis(self) -> bool:
+    def synopsis(self):
         """Options in brackets: what may be said, not what is typed."""
         return " [" in self.text
 
     @property
-    def words(self) -> list[str]:
+    def words(self):
         """Words of a shell, without settings of the environment and without what is piped in."""
         text = re.sub(r"[\[\]]|\.\.\.|…", " ", self.text) if self.synopsis else self.text
         words = shlex.split(text.rpartition(" | ")[2] if not self.synopsis else text, comments=True)
@@ -72,11 +71,11 @@ class Command:
         return [word.split("|")[0] for word in words if word != "|"]
 
 
-def read(page: str) -> str:
+def read(page):
     return (ROOT / page).read_text(encoding="utf-8")
 
 
-def blocks(page: str, *languages: str, part: str = "") -> list[Block]:
+def blocks(page, *languages, part=""):
     """Blocks of a page in order, of these languages, below the heading ``part`` of the second level."""
     text, found = read(page), []
     for match in BLOCK.finditer(text):
@@ -93,9 +92,9 @@ def blocks(page: str, *languages: str, part: str = "") -> list[Block]:
     return found
 
 
-def typed(block: Block) -> list[Command]:
+def typed(block):
     """Commands of a block of a shell, continued lines joined."""
-    found: list[Command] = []
+    found = []
     for number, line in enumerate(block.text.splitlines(), block.line):
         open_before = found and found[-1].text.endswith("\\")
         if open_before or (found and re.match(r"\s+\[", line)):
@@ -105,7 +104,7 @@ def typed(block: Block) -> list[Command]:
     return found
 
 
-def mentioned(page: str) -> list[Command]:
+def mentioned(page):
     """Commands inside sentences."""
     bare = BLOCK.sub(lambda match: "\n" * match[0].count("\n"), read(page))
     return [
@@ -115,12 +114,12 @@ def mentioned(page: str) -> list[Command]:
     ]
 
 
-def commands(page: str) -> list[Command]:
+def commands(page):
     """All commands of a page, those of its blocks first."""
     return [command for block in blocks(page) if block.language in SHELL for command in typed(block)] + mentioned(page)
 
 
-def parsed(words: list[str], whole: bool = True) -> tuple[str, dict[str, Any]]:
+def parsed(words, whole=True):
     """Name and values of a command, as the command line reads them.
 
     Not ``whole``: what is required may be left out, and a placeholder may stand for a number.
@@ -134,7 +133,7 @@ def parsed(words: list[str], whole: bool = True) -> tuple[str, dict[str, Any]]:
 
     from consistency.commands.app import app
 
-    root: Any = typer.main.get_command(app)
+    root = typer.main.get_command(app)
     name, *arguments = words
     command = root.commands[name]
     if not whole:

@@ -1,22 +1,16 @@
 """Errors whose stated covariance is the identity, drawn in worlds that differ in how steps depend on each other."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics import Record, Settings, Verdict, judge
-from consistency.referee.types import Array
+from consistency.diagnostics import Record, Settings, judge
 
 
-def independent(rng: np.random.Generator, runs: int, steps: int, n: int) -> Array:
+def independent(rng, runs, steps, n):
     return rng.standard_normal((runs, steps, n))
 
 
-def autoregression(rng: np.random.Generator, runs: int, steps: int, n: int, coefficient: float = 0.95) -> Array:
+def autoregression(rng, runs, steps, n, coefficient=0.95):
     white = rng.standard_normal((runs, steps, n))
     error = white.copy()
     for k in range(1, steps):
@@ -24,29 +18,29 @@ def autoregression(rng: np.random.Generator, runs: int, steps: int, n: int, coef
     return error
 
 
-def fully_dependent(rng: np.random.Generator, runs: int, steps: int, n: int) -> Array:
+def fully_dependent(rng, runs, steps, n):
     """One error in all steps of a run: the worst case."""
     return np.repeat(rng.standard_normal((runs, 1, n)), steps, axis=1)
 
 
-def slow_axis(rng: np.random.Generator, runs: int, steps: int, n: int) -> Array:
+def slow_axis(rng, runs, steps, n):
     """The first component is one error in all steps of a run, the others are independent."""
     error = rng.standard_normal((runs, steps, n))
     error[..., 0] = rng.standard_normal((runs, 1))
     return error
 
 
-def identities(error: Array) -> Array:
+def identities(error):
     n = error.shape[-1]
     return np.broadcast_to(np.eye(n), (*error.shape, n))
 
 
-def verdict_on(error: Array, covariance: Array | None = None, **settings: Any) -> Verdict:
+def verdict_on(error, covariance=None, **settings):
     """The verdict on errors with covariance I, or the one given."""
     return judge(Record("f", error, identities(error) if covariance is None else covariance), Settings(**settings))
 
 
-def errs_at_most(rate: float, draws: int, errs: Callable[[], Any], sure: float = 1e-5) -> bool:
+def errs_at_most(rate, draws, errs, sure=1e-5):
     """Whether errors are as rare as stated: each of the kinds that a draw of ``errs`` tells of is counted.
 
     A rate as stated is refused with a chance of at most ``sure`` a kind. Ends after a fifth of the draws, or after two,

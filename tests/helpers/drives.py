@@ -1,21 +1,16 @@
 """Files of drives and of simulations that other tools write, in the forms of their public documentation."""
 
-from __future__ import annotations
-
 import datetime
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-
-from consistency.referee.types import Array
 
 STEPS = 60
 R_IV, T_IV = Rotation.from_euler("ZYX", [0.015, -0.002, 0.008]).as_matrix(), np.array([-0.81, 0.32, -0.8])
 R_VC, T_VC = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.array([-0.004, -0.076, -0.27])
 
 
-def write_drive(folder: Path, calibrated: bool = True) -> Path:
+def write_drive(folder, calibrated=True):
     """A drive of 6 s through Karlsruhe, all angles changing."""
     (folder / "oxts/data").mkdir(parents=True)
     rng = np.random.default_rng(2013)
@@ -43,7 +38,7 @@ def write_drive(folder: Path, calibrated: bool = True) -> Path:
     return folder
 
 
-def write_states(at: Path, cameras: int = 1, more: int = 0, moving: bool = False) -> tuple[Array, Array]:
+def write_states(at, cameras=1, more=0, moving=False):
     """state_estimate.txt, state_deviation.txt and state_groundtruth.txt; errors and deviations, position first.
 
     Velocity and biases are 0 and exact, or with ``moving`` have errors and deviations like the others.

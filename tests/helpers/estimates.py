@@ -1,13 +1,9 @@
 """How far the estimates of two filters are apart."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from consistency.bench.types import Estimates
 
-
-def apart(a: Estimates, b: Estimates) -> float:
+def apart(a, b):
     """Largest difference of poses (m, rad), of covariances and of NIS relative to their size, and of log det S.
 
     Infinite where they took in other observations.

@@ -1,10 +1,6 @@
 """A small ULog, written by the public description of the format (docs.px4.io), for the tests to read."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -12,29 +8,29 @@ TOPICS = ("estimator_innovations", "estimator_innovation_variances")
 FIELDS = {"gps_hpos": 2, "gps_vpos": 1, "baro_vpos": 1, "mag_field": 3}  # of each topic, floats
 
 
-def message(kind: str, data: bytes) -> bytes:
+def message(kind, data):
     return struct.pack("<HB", len(data), ord(kind)) + data
 
 
-def declared(name: str, sample: bool = True) -> bytes:
+def declared(name, sample=True):
     stamps = "uint64_t timestamp;" + "uint64_t timestamp_sample;" * sample
     fields = "".join(f"float{f'[{size}]' if size > 1 else ''} {field};" for field, size in FIELDS.items())
     return message("F", f"{name}:{stamps}{fields}".encode())
 
 
-def header() -> bytes:
+def header():
     return b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000) + message("B", bytes(40))
 
 
 class Flight:
     """A log in the making: messages of both topics, of any instance of the EKF2."""
 
-    def __init__(self, topics: Sequence[str] = TOPICS, sample: bool = True) -> None:
+    def __init__(self, topics=TOPICS, sample=True):
         self.topics, self.sample, self.ids = topics, sample, dict[tuple[str, int], int]()
         self.head = header() + b"".join(declared(topic, sample) for topic in topics)
         self.body = b""
 
-    def log(self, topic: str, stamp: int, values: Mapping[str, object], instance: int = 0, late: int = 40) -> None:
+    def log(self, topic, stamp, values, instance=0, late=40):
         """One message: ``stamp`` of the data, us, published ``late`` us later; fields that are not given are zero."""
         key = topic, instance
         if key not in self.ids:
@@ -45,14 +41,14 @@ class Flight:
         numbers = np.concatenate([part.ravel() for part in each]).astype("<f4").tobytes()
         self.body += message("D", struct.pack("<H", self.ids[key]) + stamps + numbers)
 
-    def both(self, stamp: int, values: Mapping[str, tuple[object, object]], instance: int = 0) -> None:
+    def both(self, stamp, values, instance=0):
         """Innovations and variances of one step, by field."""
         for k, topic in enumerate(self.topics):
             self.log(topic, stamp, {name: pair[k] for name, pair in values.items()}, instance, 40 + 5 * k)
 
-    def lose(self, milliseconds: int) -> None:
+    def lose(self, milliseconds):
         self.body += message("O", struct.pack("<H", milliseconds))
 
-    def write(self, path: Path) -> Path:
+    def write(self, path):
         path.write_bytes(self.head + self.body)
         return path

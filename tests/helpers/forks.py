@@ -1,7 +1,5 @@
 """Programs as forks of a process that has imported what they begin with: most of a short program is its imports."""
 
-from __future__ import annotations
-
 import atexit
 import json
 import os
@@ -11,11 +9,8 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
-from typing import IO
 
 LIMIT = 120.0  # s, of a program that compiles nothing new, on a busy machine
 SERVER = """
@@ -53,12 +48,12 @@ while (received := socket.recv_fds(link, 2**16, 3))[0]:
 class Program:
     """A running program: of :class:`subprocess.Popen` what tests use. It leads a session of its own."""
 
-    def __init__(self, words: Sequence[str], streams: Sequence[IO[bytes] | None], told: IO[bytes]) -> None:
+    def __init__(self, words, streams, told):
         self.args, self.returncode = words, None
         self._streams, self._told = streams, told
         self.pid = int(told.readline())
 
-    def end(self) -> None:
+    def end(self):
         """Whatever it does."""
         self.kill()
         self.wait()
@@ -66,37 +61,37 @@ class Program:
             if file is not None:
                 file.close()
 
-    def wait(self, timeout: float = LIMIT) -> int:
+    def wait(self, timeout=LIMIT):
         if self.returncode is None:
             self._await(timeout)
             self.returncode = int(self._told.readline())
         return self.returncode
 
-    def poll(self) -> int | None:
+    def poll(self):
         with suppress(subprocess.TimeoutExpired):
             self.wait(0.0)
         return self.returncode
 
-    def communicate(self, timeout: float = LIMIT) -> tuple[str, str]:
+    def communicate(self, timeout=LIMIT):
         """What is in its files after its end and that of its forks; nothing of files that the caller has given."""
         self.wait(timeout)
         self._await(timeout)
         out, err = ("" if file is None else (file.seek(0), file.read())[1].decode() for file in self._streams)
         return out, err
 
-    def send_signal(self, number: int) -> None:
+    def send_signal(self, number):
         if self.poll() is None:
             os.kill(self.pid, number)
 
-    def kill(self) -> None:
+    def kill(self):
         self.send_signal(signal.SIGKILL)
 
-    def _await(self, timeout: float) -> None:
+    def _await(self, timeout):
         if not select.select([self._told], [], [], timeout)[0]:
             raise subprocess.TimeoutExpired(self.args, timeout)
 
 
-def begun(imports: str, code: str, *words: str, cwd: Path, out: int | None = None, err: int | None = None) -> Program:
+def begun(imports, code, *words, cwd, out=None, err=None):
     """Run ``code`` with the arguments ``words`` in a fork of a process that has executed ``imports``.
 
     Standard output and error go to the files with the numbers ``out`` and ``err``, or into files of the program. The
@@ -114,7 +109,7 @@ def begun(imports: str, code: str, *words: str, cwd: Path, out: int | None = Non
     return Program(words, streams, open(ours, "rb", buffering=0))
 
 
-def done(imports: str, code: str, *words: str, cwd: Path, timeout: float = LIMIT) -> subprocess.CompletedProcess[str]:
+def done(imports, code, *words, cwd, timeout=LIMIT):
     """As :func:`begun`, to its end."""
     program = begun(imports, code, *words, cwd=cwd)
     try:
@@ -124,7 +119,7 @@ def done(imports: str, code: str, *words: str, cwd: Path, timeout: float = LIMIT
 
 
 @cache
-def _server(imports: str, environment: tuple[tuple[str, str], ...]) -> socket.socket:
+def _server(imports, environment):
     """The link to a process that ends with this one."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:

@@ -1,29 +1,22 @@
 """Bags of ROS 2 with links of /tf, poses at the origin on /pose, and odometry at the origin on /odom."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 from bag import types_of
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from consistency.referee.types import Array
 
-Link = tuple[str, str, Array, Any, Any]  # parent, child, stamps, s, positions (N, 3) and quaternions (N, 4)
+def write_frames(path, links, t, odometry=None):
+    """The bag; ``odometry`` is the variance that /odom states.
 
-
-def write_frames(path: Path, links: Iterable[Link], t: Array, odometry: float | None = None) -> Path:
-    """The bag; ``odometry`` is the variance that /odom states."""
+    A link is (parent, child, stamps, s, positions (N, 3), quaternions (N, 4)).
+    """
     store = types_of(2)
     T = store.types
 
-    def geometry(name: str, *values: Any) -> Any:
+    def geometry(name, *values):
         return T[f"geometry_msgs/msg/{name}"](*values)
 
-    def header(seconds: float, frame: str) -> Any:
+    def header(seconds, frame):
         whole, rest = divmod(round(seconds * 1e9), 10**9)
         return T["std_msgs/msg/Header"](T["builtin_interfaces/msg/Time"](whole, rest), frame)
 

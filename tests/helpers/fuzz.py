@@ -6,8 +6,6 @@ checksums status 0 means that nothing else was read. Not allowed are any other e
 gigabyte, and more than 20 s. The process that reads is a child, so that a crash is a finding, too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -20,7 +18,6 @@ import traceback
 import warnings
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 ROOM = 2**30  # bytes above what the process has taken before it reads
 PATIENCE = 20  # s for a case
@@ -34,7 +31,7 @@ class Slow(BaseException):
     """A case took too long; no reader may take it for an error of its own."""
 
 
-def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
+def outcome(read, folder):
     """Exit status, stdout, stderr, and what is wrong with them whatever the file held."""
     from consistency.referee.errors import InputError
     from consistency.referee.parsing import one_line
@@ -70,7 +67,7 @@ def outcome(read: Any, folder: Path) -> tuple[int, str, str, str]:
     return status, out.getvalue(), text, wrong
 
 
-def in_pages(before: bytes, after: bytes) -> bool:
+def in_pages(before, after):
     """Whether bytes in pages of a Parquet file differ: without checksums it is a file of other numbers."""
     import numpy as np
     import pyarrow.parquet as pq
@@ -85,7 +82,7 @@ def in_pages(before: bytes, after: bytes) -> bool:
     return bool(pages[np.frombuffer(before, np.uint8) != np.frombuffer(after, np.uint8)].any())
 
 
-def cases(count: int, seed: int) -> list[tuple[int, str, str, bool]]:
+def cases(count, seed):
     """(target, file, damage, must be refused) of each case, all kinds in turn."""
     import numpy as np
     from hostile_work import TARGETS
@@ -102,14 +99,14 @@ def cases(count: int, seed: int) -> list[tuple[int, str, str, bool]]:
     return [kinds[order[i % len(kinds)]] for i in range(count)]
 
 
-def child(count: int, seed: int, begin: int) -> None:
+def child(count, seed, begin):
     """Do the cases from ``begin`` on; a line of JSON before each, and one after it."""
     import numpy as np
     import pyarrow as pa
     from hostile_work import TARGETS, write_all
     from mutations import copied
 
-    def late(*_: object) -> None:
+    def late(*_):
         raise Slow
 
     pa.set_cpu_count(1)
@@ -146,10 +143,10 @@ def child(count: int, seed: int, begin: int) -> None:
             print(json.dumps(about | {"status": status, "wrong": wrong, "err": err[-400:]}), file=said, flush=True)
 
 
-def fuzz(count: int, seed: int) -> tuple[Counter[int], list[dict[str, Any]]]:
+def fuzz(count, seed):
     """Number of cases by exit status, and the cases that are wrong."""
-    statuses: Counter[int] = Counter()
-    wrong: list[dict[str, Any]] = []
+    statuses = Counter()
+    wrong = []
     begin = 0
     while begin < count:
         command = [sys.executable, __file__, "child", str(count), str(seed), str(begin)]

@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mutations as m
 import numpy as np
@@ -84,17 +83,17 @@ class Target:
     seldom: bool = False
 
 
-def _matrices(rng: np.random.Generator, *shape: int) -> np.ndarray:
+def _matrices(rng, *shape):
     root = 0.05 * np.eye(3) + 0.01 * rng.standard_normal((*shape, 3, 3))
     return root @ np.swapaxes(root, -1, -2)
 
 
-def _world() -> cs.Scenario:
+def _world():
     changes = {"truth__steps": STEPS, "truth__landmarks__count": 60}
     return cs.load_scenario("herath2007-xyz").variant("tiny", **changes)
 
 
-def write_results(folder: Path, rng: np.random.Generator) -> None:
+def write_results(folder, rng):
     """A results folder as 'consistency run' wrote it before there were digests, one run of the second filter failed."""
     P = _matrices(rng, 2, RUNS, STEPS)
     truth = np.cumsum(rng.standard_normal((RUNS, STEPS + 1, 3)) * 0.1, axis=1)
@@ -133,7 +132,7 @@ def write_results(folder: Path, rng: np.random.Generator) -> None:
     accept_changes(folder)  # what is damaged is to be found by what is in the rows
 
 
-def _columns(rng: np.random.Generator) -> pd.DataFrame:
+def _columns(rng):
     """Estimates of two runs with their covariance and NIS."""
     rows = 2 * STEPS
     P = _matrices(rng, rows).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
@@ -146,13 +145,13 @@ def _columns(rng: np.random.Generator) -> pd.DataFrame:
     return table.assign(nis=rng.chisquare(3, rows), nis_dof=3)
 
 
-def _poses(rng: np.random.Generator) -> np.ndarray:
+def _poses(rng):
     turn = rng.standard_normal((STEPS, 4)) * 0.01 + [0, 0, 0, 1]
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     return np.column_stack([0.1 * np.arange(STEPS), rng.standard_normal((STEPS, 3)), turn])
 
 
-def _images(folder: Path, names: tuple[str, str]) -> None:
+def _images(folder, names):
     """Three grey pairs without an image library: PGM."""
     for name in names:
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -160,7 +159,7 @@ def _images(folder: Path, names: tuple[str, str]) -> None:
             (folder / name / f"{k:06d}.pgm").write_bytes(b"P5 480 320 255\n" + bytes(480 * 320))
 
 
-def write_all(folder: Path, seed: int = 1) -> None:
+def write_all(folder, seed=1):
     """One folder for each target."""
     rng = np.random.default_rng(seed)
     write_results(folder / "results", rng)
@@ -220,7 +219,7 @@ def write_all(folder: Path, seed: int = 1) -> None:
     _write_cameras(folder)
 
 
-def _write_recorded(folder: Path) -> None:
+def _write_recorded(folder):
     """A drive with an estimate beside it, states of a simulation, and a flight."""
     for name in ("drive", "states", "flight"):
         (folder / name).mkdir()
@@ -234,7 +233,7 @@ def _write_recorded(folder: Path) -> None:
     log.write(folder / "flight" / "one.ulg")
 
 
-def quietly(arguments: list[str]) -> int:
+def quietly(arguments):
     """Exit status of a command whose output nobody reads."""
     with contextlib.redirect_stdout(io.StringIO()):
         try:
@@ -244,7 +243,7 @@ def quietly(arguments: list[str]) -> int:
     return 0
 
 
-def _write_cameras(folder: Path) -> None:
+def _write_cameras(folder):
     _images(folder / "kitti", ("image_0", "image_1"))
     row = "700 0 240 {x} 0 700 160 0 0 0 1 0"
     text = f"P0: {row.format(x=0)}\nP1: {row.format(x=-350)}\n"
@@ -269,24 +268,24 @@ def _write_cameras(folder: Path) -> None:
 # --- what reads them -------------------------------------------------------------------------------
 
 
-def command(*arguments: str) -> Callable[[Path], object]:
+def command(*arguments):
     """The command line, with {} in the place of the folder."""
     return lambda folder: main([each.replace("{}", str(folder)) for each in arguments])
 
 
-def _digest(*values: Any) -> str:
+def _digest(*values):
     return hashlib.sha256(
         repr([np.asarray(v).tolist() if isinstance(v, np.ndarray) else v for v in values]).encode()
     ).hexdigest()
 
 
-def _log(folder: Path) -> None:
+def _log(folder):
     log = read_log(folder)
     for trial in log.trials:
         print(trial.run, _digest(trial.start, trial.controls, trial.z, trial.landmark, trial.truth), log.belief)
 
 
-def _scenario(folder: Path) -> None:
+def _scenario(folder):
     from consistency.bench.simulation import require_landmarks_in_view
 
     scenario = cs.load_scenario(folder / "world.toml")
@@ -295,20 +294,20 @@ def _scenario(folder: Path) -> None:
         print(_digest(require_landmarks_in_view(scenario).trial(0, 0).z))
 
 
-def _sweep(folder: Path) -> None:
+def _sweep(folder):
     from consistency.bench.sweeps.sweep_file import load_sweep
 
     print([cell.scenario.hash for cell in load_sweep(folder / "sweep.toml").cells])
 
 
-def _findings(folder: Path) -> None:
+def _findings(folder):
     from consistency.bench.runs.reproduce_findings import read_findings
 
     print(read_findings(folder))
 
 
-def _cameras(calibration: str | None = None) -> Callable[[Path], object]:
-    def read(folder: Path) -> None:
+def _cameras(calibration=None):
+    def read(folder):
         from consistency.stereo.frontend.camera_truth import find_truth, read_truth
         from consistency.stereo.visual_odometry.sequence import read_sequence
 
@@ -373,5 +372,5 @@ TARGETS = (
 )  # fmt: skip
 
 
-def clean(folder: Path) -> None:
+def clean(folder):
     shutil.rmtree(folder, ignore_errors=True)

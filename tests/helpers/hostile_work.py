@@ -1,10 +1,6 @@
 """Valid inputs of commands that work on them, for the fuzzer: results to resume, journals, maps, images, lines."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 from unittest import mock
 
 import hostile
@@ -34,7 +30,7 @@ class Killed(BaseException):
 # --- results and journals to go on with ------------------------------------------------------------
 
 
-def _write_studies(folder: Path) -> None:
+def _write_studies(folder):
     """Two runs of four: as partial results, and in the journal of a process that was killed; and all four."""
     world = cs.load_scenario("linear-gaussian").variant("tiny", truth__steps=10)
     table = world.model_dump(mode="json", exclude_none=True)
@@ -47,7 +43,7 @@ def _write_studies(folder: Path) -> None:
     shutil.copytree(folder / "resume" / "whole", folder / "journal" / "whole")
     trial = World.trial
 
-    def until_killed(self: World, run: int, seed: int) -> cs.Trial:
+    def until_killed(self, run, seed):
         if run == RUNS // 2:
             raise Killed
         return trial(self, run, seed)
@@ -60,12 +56,12 @@ def _write_studies(folder: Path) -> None:
     raise AssertionError("nothing was interrupted")
 
 
-def _run(folder: Path, out: str, runs: int, *options: str) -> list[str]:
+def _run(folder, out, runs, *options):
     place = ["--runs", str(runs), "--out", str(folder / out)]
     return ["run", str(folder / "world.toml"), *STUDY, *place, *options]
 
 
-def _resume(folder: Path) -> None:
+def _resume(folder):
     """Go on; the tables must then be those of one go, whatever was damaged."""
     status = quietly(_run(folder, "out", RUNS, "--resume"))
     if status:
@@ -77,7 +73,7 @@ def _resume(folder: Path) -> None:
 # --- maps of a sweep -------------------------------------------------------------------------------
 
 
-def _write_maps(folder: Path) -> None:
+def _write_maps(folder):
     folder.mkdir()
     grid = {"range": [2.0, 4.0], "odometry": [0.5, 1.0]}
     table = {"summary": "s", "base": "herath2007-stereo", "filters": ["ekf-uvd", "ukf-uvd"], "grid": grid}
@@ -92,14 +88,14 @@ def _write_maps(folder: Path) -> None:
     write_regime(regime_of(sweep), sweep.path)
 
 
-def _read_map(at: str) -> Callable[[Path], object]:
+def _read_map(at):
     return lambda folder: read_regime(folder / at)
 
 
 # --- images ----------------------------------------------------------------------------------------
 
 
-def _write_images(folder: Path, rng: np.random.Generator) -> None:
+def _write_images(folder, rng):
     """Three pairs of a textured wall, seen while driving along it, and three at rest."""
     import cv2
 
@@ -120,7 +116,7 @@ def _write_images(folder: Path, rng: np.random.Generator) -> None:
 # --- what reads them -------------------------------------------------------------------------------
 
 
-def _piped(folder: Path) -> None:
+def _piped(folder):
     """``monitor -`` with the file as its standard input."""
     if not (folder / "nis.csv").is_file():
         raise cs.InputError("a shell would not begin")
@@ -128,7 +124,7 @@ def _piped(folder: Path) -> None:
         command("monitor", "-", *OPTIMAL)(folder)
 
 
-def write_all(folder: Path, seed: int = 1) -> None:
+def write_all(folder, seed=1):
     """One folder for each target, those of ``hostile`` among them."""
     hostile.write_all(folder, seed)
     rng = np.random.default_rng(seed + 1)

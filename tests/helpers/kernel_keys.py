@@ -3,29 +3,26 @@
 python kernel_keys.py FOLDER
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import sys
 from importlib.machinery import SourceFileLoader
-from typing import Any
 
 
 class Doubled(ast.NodeTransformer):
     """Every number twice as large."""
 
-    def visit_Constant(self, node: ast.Constant) -> ast.Constant:
+    def visit_Constant(self, node):
         is_number = type(node.value) in (int, float)
         return ast.copy_location(ast.Constant(2 * node.value), node) if is_number else node  # type: ignore[operator]
 
 
-def edit(folder: str) -> None:
+def edit(folder):
     """Load the modules in a folder of the package's filters with other numbers, and leave no bytecode of them."""
     get_code, inside = SourceFileLoader.get_code, f"consistency.bench.filters.{folder}."
     assert not [name for name in sys.modules if name.startswith(inside)]
 
-    def edited(self: SourceFileLoader, name: str) -> Any:
+    def edited(self, name):
         if not name.startswith(inside):
             return get_code(self, name)
         tree = ast.fix_missing_locations(Doubled().visit(ast.parse(self.get_data(self.path))))
@@ -34,7 +31,7 @@ def edit(folder: str) -> None:
     SourceFileLoader.get_code = edited  # type: ignore[method-assign, assignment]
 
 
-def keys() -> dict[str, str]:
+def keys():
     """Key of the kernel of each compiled filter, on a trial of a scenario whose sensor it takes."""
     import consistency as cs
     from consistency.bench.filters import usable_names

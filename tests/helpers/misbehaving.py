@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 import consistency as cs
-from consistency.bench.types import Control, Gaussian, Observation, Trial
+from consistency.bench.types import Control, Gaussian, Trial
 
 STEP = 7  # in which they misbehave
 MEMORY = 0.0625  # GiB that they have
 
 
 class Unreadable(Exception):
-    def __str__(self) -> str:
+    def __str__(self):
         raise ValueError("no words")
 
 
@@ -38,16 +38,16 @@ class Still:
     is_doomed: bool = False
     kept: list[Any] = field(default_factory=list)
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         self.problem = problem
         return problem.start
 
-    def predict(self, state: Any, control: Control) -> Any:
+    def predict(self, state, control):
         self.step += 1
         self.is_doomed = control == self.control if self.step == 1 else self.is_doomed
         return state
 
-    def update(self, state: Any, observation: Observation) -> Any:
+    def update(self, state, observation):
         k = len(observation.landmarks)
         info = cs.Info(np.full(k, 0.5), np.eye(k), np.zeros((3, k)))
         self.answer = state, info
@@ -56,21 +56,21 @@ class Still:
             self.act(self, observation)
         return self.answer
 
-    def pose(self, state: Any) -> Gaussian:
+    def pose(self, state):
         return self.estimate
 
 
-def raises(exception: BaseException) -> Callable[..., None]:
-    def act(*_: Any) -> None:
+def raises(exception):
+    def act(*_):
         raise exception
 
     return act
 
 
-def answers(**changes: Any) -> Callable[..., None]:
+def answers(**changes):
     """Says something else for the innovation, S or the pose."""
 
-    def act(self: Still, _: Any) -> None:
+    def act(self, _):
         state, info = self.answer
         parts = {"innovation": info.innovation, "S": info.S, "mean": state, "covariance": np.eye(3)} | changes
         self.answer = state, cs.Info(parts["innovation"], parts["S"], info.gain)
@@ -79,82 +79,82 @@ def answers(**changes: Any) -> Callable[..., None]:
     return act
 
 
-def loops(*_: Any) -> None:
+def loops(*_):
     while True:
         pass
 
 
-def sleeps_in_c(*_: Any) -> None:
+def sleeps_in_c(*_):
     ctypes.PyDLL(None).sleep(100)  # with the GIL
 
 
-def segfaults(*_: Any) -> None:
+def segfaults(*_):
     ctypes.string_at(0)
 
 
-def recurses_in_c(*_: Any) -> None:
+def recurses_in_c(*_):
     sys.setrecursionlimit(10**8)
 
-    def again() -> None:
+    def again():
         sorted([1], key=lambda _: again())
 
     again()
 
 
-def takes_memory(self: Still, _: Any) -> None:
+def takes_memory(self, _):
     while True:
         self.kept.append(np.ones(2**20))
 
 
-def takes_memory_at_once(*_: Any) -> None:
+def takes_memory_at_once(*_):
     np.ones(2**40)
 
 
-def takes_a_little_too_much(*_: Any) -> None:
+def takes_a_little_too_much(*_):
     np.ones(int(1.5 * MEMORY * 2**27))
 
 
-def takes_memory_in_lists(self: Still, _: Any) -> None:
+def takes_memory_in_lists(self, _):
     while True:
         self.kept.append([0.5] * 1000)
 
 
-def closes_all_files(*_: Any) -> None:
+def closes_all_files(*_):
     os.closerange(3, 256)
     time.sleep(100)
 
 
-def forks(*_: Any) -> None:
+def forks(*_):
     os.fork()
 
 
-def forks_and_dies(*_: Any) -> None:
+def forks_and_dies(*_):
     if os.fork():
         os._exit(5)
     time.sleep(100)
 
 
-def reads(*_: Any) -> None:
+def reads(*_):
     input()
 
 
-def kills_its_thread(*_: Any) -> None:
+def kills_its_thread(*_):
     thread = threading.Thread(target=os._exit, args=(4,))
     thread.start()
     thread.join()
 
 
-def stops_itself(*_: Any) -> None:
+def stops_itself(*_):
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def ignores_signals(*_: Any) -> None:
+def ignores_signals(*_):
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM):
         signal.signal(number, signal.SIG_IGN)
     loops()
 
 
-def is_gone(pid: int, patience: float = 10.0) -> bool:
+def is_gone(pid, patience=10.0):
     """Whether a process ends in good time; it may have to be reaped by others than us."""
     until = time.monotonic() + patience
     while time.monotonic() < until:
@@ -170,7 +170,7 @@ def is_gone(pid: int, patience: float = 10.0) -> bool:
 
 TIME_OUT = "time-out after 1 s"
 NO_INNOVATION = "the innovation or its covariance is not finite"
-KINDS: dict[str, tuple[Callable[..., Any], str]] = {
+KINDS = {
     "loops": (loops, TIME_OUT),
     "sleeps in C": (sleeps_in_c, TIME_OUT),
     "ignores signals": (ignores_signals, TIME_OUT),
@@ -234,7 +234,7 @@ class Deadly:
     spared: int
     fuse: str = ""
 
-    def __call__(self, run: int) -> Trial:
+    def __call__(self, run):
         if run in self.runs and os.getpid() != self.spared and (not self.fuse or os.path.exists(self.fuse)):
             if self.fuse:
                 os.unlink(self.fuse)

@@ -9,8 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from consistency.bench.scenario.effects.effect import ListedEffect
-from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.types import Trial
 
 RATE = 0.05
 
@@ -22,14 +20,14 @@ class WrongMatch(ListedEffect):
     kind: Literal["wrong-match"] = "wrong-match"
     rate: Annotated[float, Field(ge=0, le=1)] = RATE
 
-    def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
+    def apply(self, observations, rng, context):
         hit = rng.random(len(observations.z)) < self.rate
         z = observations.z.copy()
         z[hit, 2] = rng.uniform(*context.sensor.disparity, hit.sum())
         return observations.with_z(z, np.where(hit, -1, observations.sources))
 
 
-def corrupted(trial: Trial, rng: np.random.Generator, rate: float = RATE) -> Trial:
+def corrupted(trial, rng, rate=RATE):
     """A trial of any sensor in which a share of the observations is that of another landmark of the trial."""
     hit, z = rng.random(len(trial.z)) < rate, np.array(trial.z)
     z[hit] = z[rng.integers(len(z), size=hit.sum())]

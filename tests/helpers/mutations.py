@@ -1,7 +1,5 @@
 """Small damages of valid files: what a disk, another program or a person may do to them."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil
@@ -11,7 +9,6 @@ import zipfile
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,36 +16,35 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-Rng = np.random.Generator
-Mutation = Callable[[Path, Rng], None]
+Mutation = Callable[[Path, np.random.Generator], None]
 
-HOSTILE: tuple[Any, ...] = (
+HOSTILE = (
     0, -1, 1, 0.5, -0.0, 1e-320, 1e308, -1e308, 3e30, float("nan"), float("inf"), 2**31, 2**53 + 1, 2**63 - 1, -(2**63),
     10**400, True, False, "", "text", "1e5", "nan", "ekf-uvd", "\x1b[31mred\nnext", "x" * 5000, [], [[]], [1, "a"], {},
     {"a": 1}, None,
 )  # fmt: skip
 
 
-def pick(rng: Rng, values: Any) -> Any:
+def pick(rng, values):
     return values[int(rng.integers(len(values)))]
 
 
 # --- of any file -----------------------------------------------------------------------------------
 
 
-def flip(path: Path, rng: Rng) -> None:
+def flip(path, rng):
     content = bytearray(path.read_bytes())
     for _ in range(int(rng.integers(1, 9))):
         content[int(rng.integers(len(content)))] ^= 1 << int(rng.integers(8))
     path.write_bytes(content)
 
 
-def truncate(path: Path, rng: Rng) -> None:
+def truncate(path, rng):
     content = path.read_bytes()
     path.write_bytes(content[: int(rng.integers(len(content)))])
 
 
-def splice(path: Path, rng: Rng) -> None:
+def splice(path, rng):
     """A piece of the file at another place, or left out."""
     content = path.read_bytes()
     start, end, to = sorted(int(k) for k in rng.integers(len(content), size=3))
@@ -57,39 +53,39 @@ def splice(path: Path, rng: Rng) -> None:
     )
 
 
-def garbage(path: Path, rng: Rng) -> None:
+def garbage(path, rng):
     path.write_bytes(rng.bytes(int(rng.integers(1, 3000))))
 
 
-def empty(path: Path, rng: Rng) -> None:
+def empty(path, rng):
     path.write_bytes(b"" if rng.random() < 0.5 else b"\n")
 
 
-def other_encoding(path: Path, rng: Rng) -> None:
+def other_encoding(path, rng):
     text = path.read_bytes().decode("latin-1")
     path.write_bytes(text.encode(pick(rng, ["utf-16", "utf-32", "utf-8-sig", "cp500"]), "replace"))
 
 
-def nulls(path: Path, rng: Rng) -> None:
+def nulls(path, rng):
     content, at = path.read_bytes(), int(rng.integers(path.stat().st_size))
     path.write_bytes(content[:at] + b"\0" * int(rng.integers(1, 50)) + content[at:])
 
 
-def folder(path: Path, rng: Rng) -> None:
+def folder(path, rng):
     path.unlink()
     path.mkdir()
 
 
-def missing(path: Path, rng: Rng) -> None:
+def missing(path, rng):
     path.unlink()
 
 
-def loop(path: Path, rng: Rng) -> None:
+def loop(path, rng):
     path.unlink()
     path.symlink_to(path)
 
 
-def deep(path: Path, rng: Rng) -> None:
+def deep(path, rng):
     """Nested 20,000 deep."""
     n = 20_000
     texts = ["[" * n + "]" * n, '{"a":' * n + "1" + "}" * n, "a = " + "[" * n, ".".join("a" * n) + " = 1\n", "- " * n]
@@ -97,7 +93,7 @@ def deep(path: Path, rng: Rng) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-ANY: dict[str, Mutation] = {
+ANY = {
     function.__name__: function
     for function in (flip, truncate, splice, garbage, empty, other_encoding, nulls, folder, missing, loop, deep)
 }
@@ -106,13 +102,13 @@ ANY: dict[str, Mutation] = {
 # --- of nested tables ------------------------------------------------------------------------------
 
 
-def _places(data: Any) -> list[tuple[Any, Any]]:
+def _places(data):
     """(container, key) of everything in nested tables and lists."""
     own = list(data.items()) if isinstance(data, dict) else list(enumerate(data)) if isinstance(data, list) else []
     return [(data, key) for key, _ in own] + [place for _, value in own for place in _places(value)]
 
 
-def change_tree(data: Any, rng: Rng) -> None:
+def change_tree(data, rng):
     container, key = pick(rng, _places(data))
     kind = int(rng.integers(5))
     if kind == 0:
@@ -131,13 +127,13 @@ def change_tree(data: Any, rng: Rng) -> None:
         container[key] = pick(rng, HOSTILE)
 
 
-def json_tree(path: Path, rng: Rng) -> None:
+def json_tree(path, rng):
     data = json.loads(path.read_text(encoding="utf-8"))
     change_tree(data, rng)
     path.write_text(json.dumps(data), encoding="utf-8")
 
 
-def json_twice(path: Path, rng: Rng) -> None:
+def json_twice(path, rng):
     """A key that is duplicated."""
     data = json.loads(path.read_text(encoding="utf-8"))
     table = data if isinstance(data, dict) else data[0]
@@ -146,7 +142,7 @@ def json_twice(path: Path, rng: Rng) -> None:
     path.write_text(text.replace("{", "{" + f"{json.dumps(key)}: {json.dumps(table[key])}, ", 1), encoding="utf-8")
 
 
-def toml_tree(path: Path, rng: Rng) -> None:
+def toml_tree(path, rng):
     data = tomllib.loads(path.read_text(encoding="utf-8"))
     change_tree(data, rng)
     try:
@@ -155,7 +151,7 @@ def toml_tree(path: Path, rng: Rng) -> None:
         path.write_text("x = ", encoding="utf-8")
 
 
-def toml_line_twice(path: Path, rng: Rng) -> None:
+def toml_line_twice(path, rng):
     lines = path.read_text(encoding="utf-8").splitlines()
     keys = [line for line in lines if "=" in line and not line.startswith("#")]
     line = pick(rng, keys)
@@ -166,30 +162,30 @@ def toml_line_twice(path: Path, rng: Rng) -> None:
 # --- of text in lines ------------------------------------------------------------------------------
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path):
     return path.read_text(encoding="utf-8").splitlines()
 
 
-def line_gone(path: Path, rng: Rng) -> None:
+def line_gone(path, rng):
     lines = _lines(path)
     del lines[int(rng.integers(len(lines)))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def line_twice(path: Path, rng: Rng) -> None:
+def line_twice(path, rng):
     lines = _lines(path)
     at = int(rng.integers(len(lines)))
     path.write_text("\n".join([*lines[:at], lines[at], *lines[at:]]) + "\n", encoding="utf-8")
 
 
-def lines_swapped(path: Path, rng: Rng) -> None:
+def lines_swapped(path, rng):
     lines = _lines(path)
     at, to = (int(k) for k in rng.integers(len(lines), size=2))
     lines[at], lines[to] = lines[to], lines[at]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def field(path: Path, rng: Rng) -> None:
+def field(path, rng):
     """One field changed, left out or duplicated."""
     lines = _lines(path)
     at = int(rng.integers(len(lines)))
@@ -202,13 +198,13 @@ def field(path: Path, rng: Rng) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-TEXT: dict[str, Mutation] = {f.__name__: f for f in (line_gone, line_twice, lines_swapped, field)}
+TEXT = {f.__name__: f for f in (line_gone, line_twice, lines_swapped, field)}
 
 
 # --- of archives -----------------------------------------------------------------------------------
 
 
-def arrays(path: Path, rng: Rng) -> None:
+def arrays(path, rng):
     """One array of another type, shape or value, left out or under another name."""
     with np.load(path) as archive:
         data = dict(archive)
@@ -236,7 +232,7 @@ def arrays(path: Path, rng: Rng) -> None:
     np.savez(path, **data)
 
 
-def packed(path: Path, rng: Rng) -> None:
+def packed(path, rng):
     """The same arrays, packed in another way."""
     with np.load(path) as archive:
         data = dict(archive)
@@ -248,7 +244,7 @@ def packed(path: Path, rng: Rng) -> None:
             file.writestr(f"{key}.npy", content.getvalue())
 
 
-def locked(path: Path, rng: Rng) -> None:
+def locked(path, rng):
     """A flag of the archive changed: encrypted, or packed by a method that is unknown."""
     content = bytearray(path.read_bytes())
     offset, value = pick(rng, [(8, 1), (10, 9), (10, 14), (10, 99), (8, 64)])
@@ -259,7 +255,7 @@ def locked(path: Path, rng: Rng) -> None:
     path.write_bytes(content)
 
 
-def claimed(path: Path, rng: Rng) -> None:
+def claimed(path, rng):
     """An array whose head claims a size that is not there."""
     shape = pick(rng, [(2**40,), (2**20, 2**20), (10**9, 3), (-1, 3), (2**62, 2**62)])
     head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
@@ -271,7 +267,7 @@ def claimed(path: Path, rng: Rng) -> None:
             file.writestr(name, content)
 
 
-def bomb(path: Path, rng: Rng) -> None:
+def bomb(path, rng):
     """Zeros of 0.6 GiB in 0.6 MiB."""
     with zipfile.ZipFile(path) as old:
         names = old.namelist()
@@ -282,28 +278,28 @@ def bomb(path: Path, rng: Rng) -> None:
             member.write(bytes(2**24))
 
 
-ARCHIVE: dict[str, Mutation] = {f.__name__: f for f in (arrays, packed, locked, claimed)}
+ARCHIVE = {f.__name__: f for f in (arrays, packed, locked, claimed)}
 
 
 # --- of Parquet ------------------------------------------------------------------------------------
 
 
-def _kept(table: pa.Table, path: Path) -> None:
+def _kept(table, path):
     pq.write_table(table, path, write_page_checksum=True)
 
 
-def row_gone(path: Path, rng: Rng) -> None:
+def row_gone(path, rng):
     table = pd.read_parquet(path)
     table.drop(index=int(rng.integers(len(table)))).to_parquet(path, index=False)
 
 
-def row_twice(path: Path, rng: Rng) -> None:
+def row_twice(path, rng):
     table = pd.read_parquet(path)
     row = int(rng.integers(len(table)))
     table.iloc[[*range(row + 1), *range(row, len(table))]].to_parquet(path, index=False)
 
 
-def rows_swapped(path: Path, rng: Rng) -> None:
+def rows_swapped(path, rng):
     table = pd.read_parquet(path)
     order = np.arange(len(table))
     at = rng.choice(len(table), 2, replace=False)
@@ -311,12 +307,12 @@ def rows_swapped(path: Path, rng: Rng) -> None:
     table.iloc[order].to_parquet(path, index=False)
 
 
-def cut_short(path: Path, rng: Rng) -> None:
+def cut_short(path, rng):
     table = pd.read_parquet(path)
     table.iloc[: int(rng.integers(len(table)))].to_parquet(path, index=False)
 
 
-def cell(path: Path, rng: Rng) -> None:
+def cell(path, rng):
     table = pd.read_parquet(path).astype(object)
     row, column = int(rng.integers(len(table))), int(rng.integers(table.shape[1]))
     scalars = [value for value in HOSTILE if not isinstance(value, list | dict)]
@@ -331,7 +327,7 @@ def cell(path: Path, rng: Rng) -> None:
     _kept(pa.table(columns), path)
 
 
-def column(path: Path, rng: Rng) -> None:
+def column(path, rng):
     """A column of another type, left out, renamed or duplicated."""
     table = pq.read_table(path)
     k = int(rng.integers(table.num_columns))
@@ -362,7 +358,7 @@ def column(path: Path, rng: Rng) -> None:
     _kept(table, path)
 
 
-def notes(path: Path, rng: Rng) -> None:
+def notes(path, rng):
     """Odd metadata of other programs."""
     table = pq.read_table(path)
     name = table.column_names[-1]
@@ -375,7 +371,7 @@ def notes(path: Path, rng: Rng) -> None:
     _kept(table.replace_schema_metadata({pick(rng, [b"pandas", b"ARROW:schema"]): text}), path)
 
 
-def long_run(path: Path, rng: Rng) -> None:
+def long_run(path, rng):
     """Ten million rows in a small file."""
     table = pq.read_table(path).slice(0, 1)
     columns = {name: pa.repeat(table.column(name)[0], 10**6) for name in table.column_names}
@@ -385,11 +381,11 @@ def long_run(path: Path, rng: Rng) -> None:
             writer.write_table(big)
 
 
-ROWS: dict[str, Mutation] = {f.__name__: f for f in (row_gone, row_twice, rows_swapped, cut_short)}
-COLUMNS: dict[str, Mutation] = {f.__name__: f for f in (cell, column, notes)}
+ROWS = {f.__name__: f for f in (row_gone, row_twice, rows_swapped, cut_short)}
+COLUMNS = {f.__name__: f for f in (cell, column, notes)}
 
 
-def copied(source: Path, target: Path) -> Path:
+def copied(source, target):
     """A copy of a file or folder to be damaged."""
     if target.exists() or target.is_symlink():
         shutil.rmtree(target)

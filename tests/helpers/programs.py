@@ -1,15 +1,11 @@
 """A program of a few lines of shell as an estimator under test, and tables that it writes by the number of its run."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 STEPS = 4
 
 
-def write_tables(folder: Path, runs: int, scale: float = 1.0, name: str = "tables") -> None:
+def write_tables(folder, runs, scale=1.0, name="tables"):
     """``name``/0.csv, 1.csv, ...: estimates of a, b, c whose errors have ``scale`` times the stated variance."""
     draws = np.random.default_rng(3)
     (folder / name).mkdir()
@@ -23,7 +19,7 @@ def write_tables(folder: Path, runs: int, scale: float = 1.0, name: str = "table
         (folder / name / f"{run}.csv").write_text("\n".join(lines) + "\n")
 
 
-def script(folder: Path, text: str, name: str = "filter") -> Path:
+def script(folder, text, name="filter"):
     """An executable shell script."""
     path = folder / name
     path.write_text(f"#!/bin/sh\n{text}\n")

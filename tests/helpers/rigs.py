@@ -1,7 +1,5 @@
 """A small stereo rig with a turned right camera, near that of Valencia & Andrade-Cetto (2018), and a motion."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from consistency.referee.geometry import rotation

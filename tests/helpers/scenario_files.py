@@ -1,46 +1,39 @@
 """Scenario files with changes of a built-in one."""
 
-from __future__ import annotations
-
 import tomllib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import tomli_w
 
 import consistency as cs
 from consistency.bench.scenario import data_folder
 
-Edit = Callable[[dict[str, Any]], None]
 
-
-def _inner(data: dict[str, Any], path: str) -> tuple[dict[str, Any], str]:
+def _inner(data, path):
     *parents, key = path.split(".")
     for parent in parents:
         data = data[parent]
     return data, key
 
 
-def put(path: str, value: object) -> Edit:
+def put(path, value):
     """Set ``a.b.c`` of a file's data."""
 
-    def edit(data: dict[str, Any]) -> None:
+    def edit(data):
         table, key = _inner(data, path)
         table[key] = value
 
     return edit
 
 
-def drop(path: str) -> Edit:
-    def edit(data: dict[str, Any]) -> None:
+def drop(path):
+    def edit(data):
         table, key = _inner(data, path)
         del table[key]
 
     return edit
 
 
-def load(folder: Path, *edits: Edit, name: str = "herath2007-stereo") -> cs.Scenario:
+def load(folder, *edits, name="herath2007-stereo"):
     """``mine.toml`` in the folder, read."""
     data = tomllib.loads((data_folder("scenarios") / f"{name}.toml").read_text(encoding="utf-8"))
     for edit in edits:

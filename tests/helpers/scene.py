@@ -1,12 +1,7 @@
 """Stereo images of a textured wall, rendered by its homographies, so that every motion is known exactly."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
-from consistency.referee.types import Array
 from consistency.vision import RelativePose, StereoRig
 
 SIZE = (480, 320)  # px
@@ -16,12 +11,12 @@ NORMAL, DEPTH = np.array([0.35, 0.1, 1.0]), 4.0  # of the wall: NORMAL . p = DEP
 TEXEL = 0.0125  # m, of the texture
 
 
-def rig() -> StereoRig:
+def rig():
     """The rig that the images are of."""
     return StereoRig(K, K, np.eye(3), np.array([BASELINE, 0.0, 0.0]), SIZE)
 
 
-def texture(rng: np.random.Generator, side: int = 900) -> Array:
+def texture(rng, side=900):
     """Smooth noise of several sizes, (side, side), 8 bit."""
     import cv2
 
@@ -33,12 +28,12 @@ def texture(rng: np.random.Generator, side: int = 900) -> Array:
     return np.clip(out, 0, 255).astype(np.uint8)
 
 
-def pair(camera: RelativePose, wall: Array) -> tuple[Array, Array]:
+def pair(camera, wall):
     """Left and right image from the pose of the left camera in the world."""
     return tuple(_view(camera.compose(RelativePose(np.eye(3), np.array([b, 0.0, 0.0]))), wall) for b in (0.0, BASELINE))
 
 
-def _view(camera: RelativePose, wall: Array) -> Array:
+def _view(camera, wall):
     """The wall is seen through x, y of the world: texture (i, j) stands at x = (j - side/2) TEXEL, y likewise."""
     import cv2
 
@@ -54,7 +49,7 @@ def _view(camera: RelativePose, wall: Array) -> Array:
     return np.asarray(cv2.resize(big, SIZE, interpolation=cv2.INTER_AREA))
 
 
-def drive(frames: int, step: float = 0.1) -> list[RelativePose]:
+def drive(frames, step=0.1):
     """Poses of the left camera on a straight, slightly turning way towards the wall."""
     move = RelativePose.from_vector(np.array([0.01, 0.0, step, 0.0, 0.004, 0.0]))
     poses = [RelativePose(np.eye(3), np.zeros(3))]
@@ -63,7 +58,7 @@ def drive(frames: int, step: float = 0.1) -> list[RelativePose]:
     return poses
 
 
-def write_kitti(folder: Path, poses: list[RelativePose], wall: Array) -> None:
+def write_kitti(folder, poses, wall):
     """The images, calib.txt, times.txt and poses.txt of a KITTI sequence."""
     import cv2
 

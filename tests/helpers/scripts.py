@@ -1,20 +1,17 @@
 """The scripts of ``experiments/`` as modules."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from types import ModuleType
 
 from consistency.bench.runs.experiment_scripts import figure_scripts, sibling
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 
-def experiment(name: str) -> ModuleType:
+def experiment(name):
     """A fresh module of a script, by its name without the suffix."""
     return sibling(str(FOLDER / "README.md"), name)
 
 
-def figures(name: str) -> ModuleType:
+def figures(name):
     """The module of a script in ``experiments/figures``."""
     return figure_scripts()[name]

@@ -1,36 +1,29 @@
 """Files of estimators whose errors are quantiles of a normal distribution in a fixed order: no generator of random
 numbers, so that every version of NumPy makes the same."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
-from pathlib import Path
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
 RUNS, STEPS = 40, 6
 SIGMA = np.array([0.1, 0.2, 0.03])  # m, m, rad
 P = np.outer(SIGMA, SIGMA) * [[1.0, 0.3, 0.0], [0.3, 1.0, -0.2], [0.0, -0.2, 1.0]]
 PRIMES = (2.0, 3.0, 5.0, 7.0, 11.0, 13.0)
 
 
-def normal(count: int, n: int) -> Array:
+def normal(count, n):
     """(count, n) like independent standard normal numbers: squares times roots of primes, modulo 1."""
     share = np.outer(np.square(np.arange(1, count + 1)), np.sqrt(PRIMES[:n])) % 1.0
     return np.asarray(special.ndtri(share))
 
 
-def rows(path: Path, header: str, lines: Iterable[Iterable[object]], mark: str = ",") -> Path:
+def rows(path, header, lines, mark=","):
     text = [mark.join(f"{value:.12g}" if isinstance(value, float) else str(value) for value in line) for line in lines]
     path.write_text("\n".join([header, *text] if header else text) + "\n", encoding="utf-8")
     return path
 
 
-def planar(at: Path, name: str, scale: float = 1.0, optimal: bool = False) -> Path:
+def planar(at, name, scale=1.0, optimal=False):
     """Poses in the plane with errors ``scale`` times as large as stated, beside ``truth.csv``."""
     error = scale * normal(RUNS * STEPS, 3) @ np.linalg.cholesky(P).T
     nis = scale**2 * np.square(normal(RUNS * STEPS, 5)[:, 3:]).sum(axis=1)
@@ -49,7 +42,7 @@ def planar(at: Path, name: str, scale: float = 1.0, optimal: bool = False) -> Pa
     return rows(at / f"{name}.csv", f"run,step,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh{own}", lines)
 
 
-def trajectories(at: Path, scale: float = 1.0, runs: int = 30, steps: int = 5) -> tuple[Path, Path, Path]:
+def trajectories(at, scale=1.0, runs=30, steps=5):
     """Folders est, true and cov of TUM trajectories in space, a file for each run."""
     sigma = np.array([0.1, 0.2, 0.05, 0.01, 0.02, 0.03])
     error = scale * sigma * normal(runs * steps, 6)
@@ -70,14 +63,14 @@ def trajectories(at: Path, scale: float = 1.0, runs: int = 30, steps: int = 5) -
     return at / "est", at / "true", at / "cov"
 
 
-def archive(at: Path, scale: float = 1.0) -> Path:
+def archive(at, scale=1.0):
     """Errors and covariances of two components as a NumPy archive."""
     errors = scale * normal(RUNS * STEPS, 2).reshape(RUNS, STEPS, 2)
     np.savez(at / "errors.npz", errors=errors, covariances=np.broadcast_to(np.eye(2), (RUNS, STEPS, 2, 2)))
     return at / "errors.npz"
 
 
-def drive(at: Path, steps: int = 1200) -> tuple[Path, Path]:
+def drive(at, steps=1200):
     """One log in the plane: motions, each with a covariance of its own, and the true poses."""
     error = SIGMA / 10.0 * normal(steps, 3)
     motion, true = np.array([0.5, 0.0, 0.01]), np.zeros(3)
@@ -93,6 +86,6 @@ def drive(at: Path, steps: int = 1200) -> tuple[Path, Path]:
     return one, rows(at / "driven.csv", header, truth)
 
 
-def moved(pose: Array, motion: Array) -> Array:
+def moved(pose, motion):
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return pose + np.array([c * motion[0] - s * motion[1], s * motion[0] + c * motion[1], motion[2]])

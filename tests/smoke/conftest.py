@@ -1,10 +1,5 @@
 """Processes that a test began end with it; commands that are refused, in this process, which saves seconds."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
 import pytest
 from own_process import BEGUN
 
@@ -12,17 +7,17 @@ from consistency.commands import main
 
 
 @pytest.fixture(autouse=True)
-def nothing_left_behind() -> Iterator[None]:
+def nothing_left_behind():
     yield
     while BEGUN:
         BEGUN.pop().end()
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+def refused(monkeypatch, capsys):
     """``refused(folder, *words)``: what a command says that exits with 2, in two lines at most, and writes nothing."""
 
-    def refused(folder: Path, *words: str) -> str:
+    def refused(folder, *words):
         monkeypatch.chdir(folder)
         before = sorted(folder.rglob("*"))
         with pytest.raises(SystemExit) as end:

@@ -1,13 +1,9 @@
 """The command line in a process of its own."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from pathlib import Path
 
 import forks
-from forks import Program
 
 COMPILING = 300.0  # s, of a command that may compile
 IMPORTS = """
@@ -20,16 +16,16 @@ cs.get_filter("ekf-uvd")
 cs.analyse(cs.run_trials(cs.load_scenario("linear-gaussian").variant("short", truth__steps=8), ["kf"], 20, jobs=1))
 """
 CODE = "from consistency.__main__ import main; sys.exit(main())"
-BEGUN: list[Program] = []  # ended after the test, whatever became of it
+BEGUN = []  # ended after the test, whatever became of it
 
 
-def begun(*arguments: str, cwd: Path, before: str = "", out: int | None = None, err: int | None = None) -> Program:
+def begun(*arguments, cwd, before="", out=None, err=None):
     """The command line in a fork, which does ``before`` first."""
     BEGUN.append(forks.begun(IMPORTS, f"{before}\n{CODE}", "consistency", *arguments, cwd=cwd, out=out, err=err))
     return BEGUN[-1]
 
 
-def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
+def consistency(*arguments, cwd, status=0):
     """Run the command line; the exit status must be ``status``.
 
     In a process that begins with nothing where it compiles, or chooses a processor before Numba is loaded.
@@ -46,7 +42,7 @@ def consistency(*arguments: str, cwd: Path, status: int = 0) -> subprocess.Compl
     return done
 
 
-def size_of(path: Path) -> int:
+def size_of(path):
     """Bytes of a file that may go at any moment; 0 if it is not there."""
     try:
         return path.stat().st_size

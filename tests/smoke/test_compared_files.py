@@ -54,8 +54,8 @@ def test_a_baseline_of_files(folder):
     for name in ("kept.json", "kept"):
         done = consistency("baseline", "honest.csv", *OPTIONS, "--out", name, cwd=folder)
         assert "next: consistency compare NEW" in done.stdout
-        done = consistency("compare", "proud.csv", name, *OPTIONS, "--fail-on", "worse", cwd=folder, status=1)
-        assert "run by run on the same trials" in done.stdout
+    done = consistency("compare", "proud.csv", "kept", *OPTIONS, "--fail-on", "worse", cwd=folder, status=1)
+    assert "run by run on the same trials" in done.stdout
     done = consistency("compare", "kept.json", "kept", cwd=folder)
     assert "every run is the same in both" in done.stdout
     moved = ("--truth", "moved.csv", "--state", "a,b")

@@ -25,16 +25,13 @@ def test_plan(tmp_path):
     )
     assert "301 runs" in done.stdout
     assert "260 runs would do for a single chi-square test" in done.stdout
-    for ratio, one_step in (("1.2", 260), ("1.5", 53), ("2", 18)):
-        done = consistency("plan", "--detect", ratio, "--json", cwd=tmp_path)
-        assert json.loads(done.stdout)["one_step"] == one_step
+    done = consistency("plan", "--detect", "2", "--json", cwd=tmp_path)
+    assert json.loads(done.stdout)["one_step"] == 18
 
 
 def test_plan_by_a_pilot(folder, tmp_path):
     """A run is worth at least what its pilot shows, and a plan never takes more runs than the worst case."""
     consistency("run", "linear-gaussian", "--filter", "kf", "--runs", "25", "--out", "pilot", cwd=tmp_path)
-    done = consistency("plan", "--like", "pilot", "--detect", "1.2", cwd=tmp_path)
-    assert "where steps depend on each other as those of kf in 25 pilot runs" in done.stdout
     pilot = json.loads(consistency("plan", "--like", "pilot", "--detect", "1.2", "--json", cwd=tmp_path).stdout)
     assert pilot["runs"] == 301
     assert 20 <= pilot["like"]["kf"]["runs"] <= 301

@@ -42,15 +42,6 @@ def test_a_pure_offset_is_biased(rng):
         assert "without the bias the covariance ratio is" in verdict.reasons[0]
 
 
-def test_an_offset_in_some_steps_is_biased(rng):
-    error = independent(rng, 100, 30, 3)
-    error[:, 11, 1] += 2.0
-    verdict = verdict_on(error, false_alarm=SURE)
-    assert verdict.status == "biased"
-    assert " sigma in axis 1, in step 12" in verdict.reasons[0]
-    assert verdict.reasons[0].lower().count("biased") == 1
-
-
 def test_an_offset_and_a_wrong_scale_are_both_said(rng):
     verdict = verdict_on(2.0 * independent(rng, 100, 30, 3) + np.array([2.0, 0.0, 0.0]), false_alarm=SURE)
     assert verdict.status == "overconfident"
@@ -64,15 +55,6 @@ def test_an_offset_does_not_make_a_small_error_large(rng):
     verdict = verdict_on(np.sqrt(0.5) * independent(rng, 100, 30, 3) + 1.2, false_alarm=SURE)
     assert verdict.bias.inflation_without.high < 0.6
     assert verdict.status in ("biased", "conservative")
-
-
-@pytest.mark.parametrize("ratio, status", [(2.0, "overconfident"), (0.5, "conservative")])
-def test_a_wrong_scale(rng, ratio, status):
-    verdict = verdict_on(np.sqrt(ratio) * autoregression(rng, 61, 40, 3), false_alarm=SURE)
-    assert verdict.status == status
-    side = "too small" if ratio > 1 else "too large"
-    assert verdict.reasons[0].startswith(f"{status}: covariance {side} by x") or "since step" in verdict.reasons[0]
-    assert verdict.reasons[0].endswith("no bias found")
 
 
 def test_a_few_large_errors_are_heavy_tails(rng):
@@ -100,22 +82,6 @@ def test_heavy_tails_of_many_runs_are_called_so(rng):
     statuses = [verdict_on(np.sqrt(0.6) * rng.standard_t(5, (100, 60, 3))).status for _ in range(20)]
     assert statuses.count("heavy-tailed") >= 14
     assert statuses.count("overconfident") + statuses.count("conservative") <= stats.binom.isf(SURE, 20, 0.05)
-
-
-def test_a_wrong_correlation_is_inconsistent(rng):
-    error = independent(rng, 100, 30, 3)
-    error[..., 2] = 0.8 * error[..., 0] + 0.6 * error[..., 2]
-    verdict = verdict_on(error, false_alarm=SURE)
-    assert verdict.status == "inconsistent"
-    assert "covariance of the wrong shape: correlation +0." in verdict.reasons[0]
-    assert "stated +0.00, of axis 0 and axis 2" in verdict.reasons[0]
-
-
-def test_axes_that_err_in_opposite_directions_are_inconsistent(rng):
-    verdict = verdict_on(independent(rng, 100, 30, 2) * np.sqrt([1.6, 0.4]), false_alarm=SURE)
-    assert "scale" not in verdict.faults or abs(verdict.inflation - 1.0) < 0.1
-    assert re.search(r"too small by x1\.\d\d \[[^]]+\] in axis 0, too large by x2\.", verdict.reasons[0])
-    assert verdict.status == "inconsistent"
 
 
 def test_failures_are_failed_unless_a_fault_is_found(rng):
@@ -548,14 +514,6 @@ def test_what_is_not_found_is_not_tolerated_either(rng):
     assert verdict.p_value == pytest.approx(min(min(1.0, a.p_value / a.share) for a in verdict.answers))
 
 
-def test_more_than_the_tolerance_is_a_fault(rng):
-    for ratio, status in ((1.2, "overconfident"), (1 / 1.2, "conservative")):
-        error = np.sqrt(ratio) * autoregression(rng, 1000, 40, 3, 0.5)
-        verdict = verdict_on(error, false_alarm=1e-3, tolerance=1.1)
-        assert verdict.status == status
-        assert not any(a.tolerated for a in verdict.answers)
-
-
 def test_a_tolerance_is_not_for_what_was_not_shown(rng):
     """x1.5 with 21 runs is found; that it is inside 1.6 is not shown, so that it stays a fault."""
     for _ in range(10):
@@ -630,7 +588,7 @@ def test_innovations_of_a_declared_gain_count(rng):
     size = f"innovations larger than stated (NIS per degree of freedom {short(verdict.innovations.ratio)})"
     assert verdict.reasons[0] == f"inconsistent: {size}"
     only = judge(Record("f", optimal_gain=True, **nis), Settings(SURE))
-    assert only.reasons[0] == f"overconfident: {size}; without truth most pose errors cannot be seen"
+    assert only.reasons[0] == f"overconfident: {size}; no truth: most pose errors cannot be seen"
     u = independent(rng, 60, 20, 2)
     u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
     correlated = judge(

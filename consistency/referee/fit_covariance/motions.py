@@ -92,7 +92,8 @@ def _write_tables(stretches: Sequence[Poses], folder: Path) -> None:
         motions.append(np.column_stack([keys, each.estimate, *stated]))
         truth.append(np.column_stack([keys, each.truth]))
     head = np.array(["run", "step", "t", "x", "y", "heading", *COVARIANCE])
-    for name, rows in (("motions", np.concatenate(motions)), ("truth", np.concatenate(truth))):
+    for name, parts in (("motions", motions), ("truth", truth)):
+        rows = np.concatenate(parts)
         known = ~np.isnan(rows).any(axis=0)
         columns = ",".join(head[: len(known)][known])
         np.savetxt(folder / f"{name}.csv", rows[:, known], DIGITS, ",", header=columns, comments="")

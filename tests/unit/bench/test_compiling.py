@@ -1,17 +1,13 @@
 """Kernels compiled side by side: nothing is left behind, whoever is killed, and what is not kept is compiled here."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import forks
 import pytest
@@ -24,7 +20,6 @@ from consistency.bench.runs import missing_kernels
 from consistency.bench.runs.experiment_scripts import experiments
 from consistency.bench.scenario import load_scenario
 
-Done = Callable[..., tuple[str, str]]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
 SCRIPT = """
 import multiprocessing, os, resource, signal, sys, time
@@ -83,7 +78,7 @@ Kernel(total)((1.0,))  # what another user may not read is loaded
 
 
 @pytest.fixture
-def folder() -> Iterator[Path]:
+def folder():
     """A folder that other users can read, for the cache and the numbers of the processes that have compiled."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name)
@@ -94,10 +89,10 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def done(folder: Path) -> Done:
+def done(folder):
     """Does a case, and gives what it says on standard output and error."""
 
-    def done(what: str = "", jobs: int = 2) -> tuple[str, str]:
+    def done(what="", jobs=2):
         code = f"folder, what, jobs, here = {str(folder)!r}, {what!r}, {jobs}, os.getpid(); case()"
         program = forks.done(SCRIPT, code, "-c", cwd=folder)
         assert program.returncode == (-signal.SIGKILL if what == "abandon" else 0), program.stderr
@@ -106,16 +101,16 @@ def done(folder: Path) -> Done:
     return done
 
 
-def processes(folder: Path) -> list[int]:
+def processes(folder):
     return [int(path.name) for path in (folder / "processes").iterdir() if path.name.isdecimal()]
 
 
-def living(folder: Path) -> list[int]:
+def living(folder):
     return [number for number in processes(folder) if Path(f"/proc/{number}").exists()]
 
 
 @LINUX
-def test_kernels_are_compiled_side_by_side_and_once(done: Done, folder: Path) -> None:
+def test_kernels_are_compiled_side_by_side_and_once(done, folder):
     """Two of the three filters have one kernel."""
     out, err = done()
     assert out == "3.0 6.0 9.0 1 1 1"
@@ -128,7 +123,7 @@ def test_kernels_are_compiled_side_by_side_and_once(done: Done, folder: Path) ->
 
 
 @LINUX
-def test_one_job_compiles_here(done: Done, folder: Path) -> None:
+def test_one_job_compiles_here(done, folder):
     out, err = done(jobs=1)
     assert out == "3.0 6.0 9.0 0 0 1"
     assert err.count("\n") == 1
@@ -136,13 +131,13 @@ def test_one_job_compiles_here(done: Done, folder: Path) -> None:
 
 
 @LINUX
-def test_what_killed_compilers_leave_is_compiled_here(done: Done, folder: Path) -> None:
+def test_what_killed_compilers_leave_is_compiled_here(done, folder):
     assert done("die")[0] == "3.0 6.0 9.0 0 0 1"
     assert 1 <= len(processes(folder)) <= 2
 
 
 @LINUX
-def test_a_disk_that_is_full_costs_the_cache_alone(done: Done, folder: Path) -> None:
+def test_a_disk_that_is_full_costs_the_cache_alone(done, folder):
     """A limit on the size of files, which refuses what is written in the middle of it."""
     out, err = done("full")
     assert out == "3.0 6.0 9.0 0 0 0"
@@ -152,7 +147,7 @@ def test_a_disk_that_is_full_costs_the_cache_alone(done: Done, folder: Path) -> 
 
 @LINUX
 @pytest.mark.parametrize("what", ["hang", "abandon"])
-def test_no_compiler_outlives_who_waits_for_it(done: Done, folder: Path, what: str) -> None:
+def test_no_compiler_outlives_who_waits_for_it(done, folder, what):
     """Whether that is stopped or killed."""
     assert done(what)[0] == ("stopped" if what == "hang" else "")
     assert processes(folder)
@@ -163,7 +158,7 @@ def test_no_compiler_outlives_who_waits_for_it(done: Done, folder: Path, what: s
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can become another user")
-def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_of_root_serve_other_users(done, folder, monkeypatch):
     """As in an image: made by root, read-only to who runs, who can still compile what is missing."""
     (folder / "processes").chmod(0o777)
     done(jobs=1)
@@ -184,18 +179,18 @@ def test_kernels_of_root_serve_other_users(done: Done, folder: Path, monkeypatch
     assert {*before} - {*disk_cache.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
 
 
-def test_what_others_cannot_read_is_compiled_here(capsys: pytest.CaptureFixture[str]) -> None:
-    made: list[int] = []
+def test_what_others_cannot_read_is_compiled_here(capsys):
+    made = []
     outlook = Outlook("", is_ready=False, is_shared=False, size=4)
-    mine: Any = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
+    mine = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
     need = missing_kernels.Need(mine, None, None, outlook)  # type: ignore[arg-type]
     missing_kernels._compile([need, need], 2)
     assert made == [1, 1]
     assert capsys.readouterr().err == "compiling 2 kernels of mine, once: 10 to 60 s for each\n"
 
 
-def test_a_few_filters_are_named() -> None:
-    needs: Any = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
+def test_a_few_filters_are_named():
+    needs = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
     assert missing_kernels._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
     assert missing_kernels._label(needs[:1]) == "compiling the kernel of a"
 
@@ -203,19 +198,19 @@ def test_a_few_filters_are_named() -> None:
 # --- the size ---------------------------------------------------------------------------------------
 
 
-def inner(x: float) -> float:
+def inner(x):
     return x + 1.0
 
 
-def outer(x: float) -> float:
+def outer(x):
     return inner(x) * 2.0
 
 
-def test_the_size_is_that_of_all_functions() -> None:
+def test_the_size_is_that_of_all_functions():
     assert Content(outer, ()).size == sum(len(f.__code__.co_code) for f in (inner, outer))
 
 
-def test_a_kernel_is_ready_once_it_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_is_ready_once_it_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     kernel = Kernel(total)
     first = kernel.outlook(1)
@@ -225,28 +220,28 @@ def test_a_kernel_is_ready_once_it_is_compiled(tmp_path: Path, monkeypatch: pyte
     assert kernel.outlook(1) == first
 
 
-def total(x: float) -> float:
+def total(x):
     return x + x
 
 
-def test_the_largest_kernel_is_compiled_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_kernel_is_compiled_first(monkeypatch):
     """It may take as long as two others."""
-    begun: list[int] = []
+    begun = []
 
     class Pool:
-        def __init__(self, *_: Any, **__: Any) -> None: ...
+        def __init__(self, *_, **__): ...
 
-        def submit(self, _: Any, size: int) -> Future[None]:
+        def submit(self, _, size):
             begun.append(size)
-            done: Future[None] = Future()
+            done = Future()
             done.set_result(None)
             return done
 
-        def shutdown(self, **_: Any) -> None: ...
+        def shutdown(self, **_): ...
 
     monkeypatch.setattr(missing_kernels, "ProcessPoolExecutor", Pool)
     monkeypatch.setattr(missing_kernels, "_pickled", lambda need: need.outlook.size)
-    needs: Any = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
+    needs = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
     missing_kernels._compile_side_by_side(needs, 2)
     assert begun == [3, 2, 1]
 
@@ -254,7 +249,7 @@ def test_the_largest_kernel_is_compiled_first(monkeypatch: pytest.MonkeyPatch) -
 # --- before what takes long -------------------------------------------------------------------------
 
 
-def test_what_experiments_say_that_they_need_fits() -> None:
+def test_what_experiments_say_that_they_need_fits():
     needs = [need for module in experiments().values() for need in getattr(module, "KERNELS", {}).items()]
     assert len(needs) > 5
     for world, names in needs:

@@ -1,14 +1,9 @@
 """Runs on workers of dask, on loopback: the bytes of local ones, whatever dies meanwhile."""
 
-from __future__ import annotations
-
 import os
 import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import pytest
 from cluster import Cluster, free_port
@@ -20,10 +15,7 @@ from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation
 from consistency.bench.runs.local_workers import LocalThreads
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.trial_work import Simulated, TrialWork
-from consistency.bench.store.results import StoredResults
-from consistency.bench.types import Trial
 from consistency.referee.system.provenance import this_machine
 
 pytestmark = [
@@ -35,29 +27,29 @@ SEED = 3
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+def cluster(tmp_path_factory):
     with Cluster(tmp_path_factory.mktemp("cluster")) as cluster:
         yield cluster
 
 
 @pytest.fixture(scope="module")
-def world(xyz: cs.Scenario) -> cs.Scenario:
+def world(xyz):
     return xyz
 
 
 @pytest.fixture(scope="module")
-def filters(world: cs.Scenario) -> list[str | Still]:
+def filters(world):
     """One that is compiled, and one whose process ends in one run."""
     doomed = cs.Control(*Simulated(world, SEED)(7).controls[0])
     return ["ekf-xyz", Still("still", KINDS["os._exit(3)"][0], doomed)]
 
 
 @pytest.fixture(scope="module")
-def whole(world: cs.Scenario, filters: list[str | Still], tmp_path_factory: pytest.TempPathFactory) -> StoredResults:
+def whole(world, filters, tmp_path_factory):
     return run_trials(world, filters, RUNS, SEED, 2, out=tmp_path_factory.mktemp("local") / "whole")
 
 
-def require_same(one: Path, other: Path) -> None:
+def require_same(one, other):
     names = sorted(path.name for path in other.glob("*.parquet"))
     assert names == sorted(path.name for path in one.glob("*.parquet"))
     for name in names:
@@ -67,23 +59,21 @@ def require_same(one: Path, other: Path) -> None:
 class Disturbed(Executor):
     """An executor during whose work something happens, when so many batches have come back."""
 
-    def __init__(self, executor: Executor, after: int, disturb: Callable[[], object]) -> None:
+    def __init__(self, executor, after, disturb):
         self.executor, self.left, self.disturb = executor, after, disturb
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+    def submit(self, function, /, *arguments, **options):
         future = self.executor.submit(function, *arguments, **options)
         future.add_done_callback(self.came)
         return future
 
-    def came(self, _: Future[Any]) -> None:
+    def came(self, _):
         self.left -= 1
         if self.left == 0:
             self.disturb()
 
 
-def test_the_bytes_are_those_of_local_runs(
-    cluster: Cluster, world: cs.Scenario, filters: list[str | Still], whole: StoredResults, tmp_path: Path
-) -> None:
+def test_the_bytes_are_those_of_local_runs(cluster, world, filters, whole, tmp_path):
     with DaskExecutor(cluster.address) as executor:
         results = run_trials(world, filters, RUNS, SEED, out=tmp_path / "out", executor=executor)
     require_same(results.folder, whole.folder)
@@ -91,16 +81,14 @@ def test_the_bytes_are_those_of_local_runs(
     assert len(results.failures) == len(whole.failures)
 
 
-def test_a_worker_that_is_killed_loses_nothing(
-    cluster: Cluster, world: cs.Scenario, filters: list[str | Still], whole: StoredResults, tmp_path: Path
-) -> None:
+def test_a_worker_that_is_killed_loses_nothing(cluster, world, filters, whole, tmp_path):
     """By dask's own executor, of a client of one's own."""
     third = cluster.add_worker()
     with Client(cluster.address, set_as_default=False) as client:
         client.wait_for_workers(3, timeout=60)
         pids = client.run(os.getpid)
 
-        def kill() -> None:
+        def kill():
             os.killpg(third.pid, signal.SIGKILL)
             os.kill(next(iter(pids.values())), signal.SIGKILL)  # whose nanny lives and starts another
 
@@ -110,7 +98,7 @@ def test_a_worker_that_is_killed_loses_nothing(
 
 
 @pytest.mark.slow
-def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
+def test_runs_that_kill_their_workers_have_failed(world):
     trials, isolation = Simulated(world, SEED), Isolation([cs.get_filter("ekf-xyz")], world.belief)
     work = TrialWork(Deadly(trials, (0, 20), os.getpid()), isolation)
     with DaskExecutor(jobs=2) as executor:
@@ -118,16 +106,14 @@ def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
     assert sorted(outcomes) == list(range(30))
     assert {run for run, outcome in outcomes.items() if outcome.failures} == {0, 20}
     assert outcomes[20].failures[0].reason == "its worker died (KilledWorker)"
-    expected: dict[int, RunOutcome] = {
-        o.run: o for o in LocalThreads(1).outcomes(TrialWork(trials, isolation), range(30))
-    }
+    expected = {o.run: o for o in LocalThreads(1).outcomes(TrialWork(trials, isolation), range(30))}
     for run in set(outcomes) - {0, 20}:
         for column, values in outcomes[run].estimates["ekf-xyz"].items():
             assert values.tobytes() == expected[run].estimates["ekf-xyz"][column].tobytes()
 
 
 @pytest.mark.parametrize(
-    ("error", "raised", "sentence"),
+    "error, raised, sentence",
     [
         (cs.InputError("run 5 is not to be"), cs.InputError, r"^run 5 is not to be$"),
         (
@@ -137,12 +123,10 @@ def test_runs_that_kill_their_workers_have_failed(world: cs.Scenario) -> None:
         ),
     ],
 )
-def test_an_error_of_a_worker_is_an_error_here(
-    world: cs.Scenario, cluster: Cluster, error: Exception, raised: type[Exception], sentence: str
-) -> None:
+def test_an_error_of_a_worker_is_an_error_here(world, cluster, error, raised, sentence):
     @dataclass(frozen=True)
     class Broken:
-        def __call__(self, run: int) -> Trial:
+        def __call__(self, run):
             raise error
 
     work = TrialWork(Broken(), Isolation([Still("still")], world.belief))
@@ -150,7 +134,7 @@ def test_an_error_of_a_worker_is_an_error_here(
         list(ExecutorWorkers(executor).outcomes(work, [5]))
 
 
-def test_nobody_at_the_address(world: cs.Scenario, tmp_path: Path) -> None:
+def test_nobody_at_the_address(world, tmp_path):
     address = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(cs.InputError, match=f"^the scheduler {address} cannot be reached for 0.5 s$"):
         run_trials(world, ["ekf-xyz"], RUNS, out=tmp_path / "out", executor=DaskExecutor(address, wait=0.5))
@@ -158,7 +142,7 @@ def test_nobody_at_the_address(world: cs.Scenario, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    "options, sentence",
     [
         ({"scheduler": "nobody"}, "scheduler 'nobody' is neither an address, such as tcp://host:8786, nor a "),
         ({"wait": 0.0}, "the wait for a scheduler must be positive, got 0"),
@@ -169,11 +153,11 @@ def test_nobody_at_the_address(world: cs.Scenario, tmp_path: Path) -> None:
         ({"jobs": -2}, "jobs must be at least 1, or -1"),
     ],
 )
-def test_what_makes_no_sense_is_refused(options: dict[str, object], sentence: str) -> None:
+def test_what_makes_no_sense_is_refused(options, sentence):
     with pytest.raises(cs.InputError, match=f"^{sentence}"):
         DaskExecutor(**options)  # type: ignore[arg-type]
 
 
-def test_tls_without_certificates(world: cs.Scenario) -> None:
+def test_tls_without_certificates(world):
     with pytest.raises(cs.InputError, match=r"^scheduler tls://127.0.0.1:1: tls needs the certificates"):
         run_trials(world, ["ekf-xyz"], RUNS, executor=DaskExecutor("tls://127.0.0.1:1", wait=0.5))

@@ -339,12 +339,6 @@ def test_rejections_are_kept_streamed_and_resumed(wrong, tmp_path):
         assert (row.offered, row.spurious, row.rejected, row.rejected_spurious) == counts
 
 
-def test_without_a_guard_there_is_no_file(uvd, tmp_path):
-    cs.run_trials(uvd, ["ekf-uvd"], runs=1, jobs=1, out=tmp_path / "out")
-    assert not (tmp_path / "out" / "rejections.parquet").exists()
-    assert cs.read_results(tmp_path / "out").rejections is None
-
-
 def test_a_failed_run_counts_up_to_its_end(uvd):
     class Breaks(Counter):
         def update(self, state, observation):

@@ -1,7 +1,5 @@
 """Whatever a filter does to its process, its run is a result, and the filter beside it has its bits."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -9,10 +7,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cloudpickle
@@ -20,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from misbehaving import KINDS, MEMORY, STEP, TIME_OUT, Still, answers, forks, is_gone, raises
+from numpy.testing import assert_array_equal
 from threadpoolctl import threadpool_info
 
 import consistency as cs
@@ -30,7 +27,6 @@ from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.outcomes_to_results import Gathered
 from consistency.bench.runs.run_outcome import outcome_of
 from consistency.bench.store.journal import IN_MEMORY, Journal
-from consistency.bench.types import Control, Observation
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, and limits of memory")
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # no process of a filter imports all of this, for seconds
@@ -40,28 +36,26 @@ LONG = 60.0  # s, a time-out that is not expected
 
 
 @pytest.fixture(scope="module")
-def world() -> cs.Scenario:
+def world():
     return cs.load_scenario("herath2007-xyz").variant("short", truth__steps=12)
 
 
 @pytest.fixture(scope="module")
-def doomed(world: cs.Scenario) -> Control:
+def doomed(world):
     return cs.simulate(world, DOOMED).control(1)
 
 
 @pytest.fixture(scope="module")
-def calm(world: cs.Scenario) -> pd.DataFrame:
+def calm(world):
     return cs.run_trials(world, [Still("calm"), "ekf-xyz"], runs=RUNS, jobs=1).estimates
 
 
-def rows(estimates: pd.DataFrame, *names: str) -> pd.DataFrame:
+def rows(estimates, *names):
     return estimates[estimates["filter"].isin(names)].reset_index(drop=True)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_filter_that_misbehaves_is_contained(
-    kind: str, world: cs.Scenario, doomed: Control, calm: pd.DataFrame
-) -> None:
+def test_a_filter_that_misbehaves_is_contained(kind, world, doomed, calm):
     """One failed run with its step and reason; all other rows as they are without it, to the bit."""
     act, reason = KINDS[kind]
     filters = [Still("bad", act, doomed), Still("calm"), "ekf-xyz"]
@@ -78,9 +72,7 @@ def test_a_filter_that_misbehaves_is_contained(
     pd.testing.assert_frame_equal(rows(results.estimates, "bad"), expected, check_exact=True)
 
 
-def test_a_filter_that_copies_its_process_is_heard_once(
-    world: cs.Scenario, doomed: Control, calm: pd.DataFrame
-) -> None:
+def test_a_filter_that_copies_its_process_is_heard_once(world, doomed, calm):
     results = cs.run_trials(world, [Still("bad", forks, doomed)], runs=RUNS, jobs=1, timeout=LONG)
     assert len(results.failures) == 0
     pd.testing.assert_frame_equal(results.estimates, rows(calm, "calm").assign(filter="bad"), check_exact=True)
@@ -89,14 +81,14 @@ def test_a_filter_that_copies_its_process_is_heard_once(
 # --- each filter has arrays of its own ---------------------------------------------------------
 
 
-def scribbles(self: Still, observation: Observation) -> None:
+def scribbles(self, observation):
     for array in (self.problem.start, observation.z, observation.landmarks):
         array.flags.writeable = True
         array[...] = 7
 
 
 @pytest.mark.parametrize("apart", [True, False])
-def test_arrays_made_writable_change_nothing_for_others(world: cs.Scenario, doomed: Control, apart: bool) -> None:
+def test_arrays_made_writable_change_nothing_for_others(world, doomed, apart):
     trial = cs.simulate(world, DOOMED)
     before = {name: array.copy() for name, array in vars(trial).items() if isinstance(array, np.ndarray)}
     bad = Still("bad", scribbles, doomed)
@@ -107,13 +99,13 @@ def test_arrays_made_writable_change_nothing_for_others(world: cs.Scenario, doom
         run_filter(bad, trial, world.belief)
     assert len(before) >= 7
     for name, array in before.items():
-        np.testing.assert_array_equal(getattr(trial, name), array)
+        assert_array_equal(getattr(trial, name), array)
 
 
 # --- what a run leaves ---------------------------------------------------------------------------
 
 
-def test_nothing_of_the_failed_step_is_kept(world: cs.Scenario, doomed: Control) -> None:
+def test_nothing_of_the_failed_step_is_kept(world, doomed):
     """No pose, no NIS, no degrees of freedom."""
     trial = cs.simulate(world, DOOMED)
     with_info = next(k for k in range(1, 13) if len(trial.observation(k).landmarks))
@@ -128,7 +120,7 @@ def test_nothing_of_the_failed_step_is_kept(world: cs.Scenario, doomed: Control)
     assert np.isfinite(said.nis[with_info - 1])
 
 
-def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> None:
+def test_a_nees_that_no_number_holds_fails_any_filter(world):
     """Also one whose own error is out of bounds, or whose NIS is, as a kernel may say it."""
     trial = cs.simulate(world)
     with Isolation([Still("calm")], world.belief) as isolation:
@@ -143,7 +135,7 @@ def test_a_nees_that_no_number_holds_fails_any_filter(world: cs.Scenario) -> Non
         array[STEP - 1] = kept
 
 
-def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control) -> None:
+def test_names_and_reasons_stand_on_one_line(world, doomed):
     with pytest.raises(cs.InputError, match=r"filter: the name 'two\\nlines' has a control character"):
         cs.run_trials(world, [Still("two\nlines")], runs=1)
     exception = RuntimeError("one\n::error::two\x1b[2J\udc80")
@@ -151,13 +143,11 @@ def test_names_and_reasons_stand_on_one_line(world: cs.Scenario, doomed: Control
     assert failure.reason.startswith("RuntimeError: one ::error::two [2J\\udc80 (in update, misbehaving.py:")
 
 
-def inverts(*_: Any) -> None:
+def inverts(*_):
     np.linalg.inv(np.zeros((2, 2)))
 
 
-def test_an_algebra_error_of_the_users_is_theirs_and_only_a_wrong_s_is_said_of_s(
-    world: cs.Scenario, doomed: Control
-) -> None:
+def test_an_algebra_error_of_the_users_is_theirs_and_only_a_wrong_s_is_said_of_s(world, doomed):
     trial = cs.simulate(world, DOOMED)
     line = inverts.__code__.co_firstlineno + 1
     failure = run_filter(Still("bad", inverts, doomed), trial, world.belief).failure
@@ -167,9 +157,9 @@ def test_an_algebra_error_of_the_users_is_theirs_and_only_a_wrong_s_is_said_of_s
     assert failure.reason == "the innovation covariance is not positive definite"
 
 
-def test_an_error_of_the_map_names_the_map(world: cs.Scenario) -> None:
+def test_an_error_of_the_map_names_the_map(world):
     class Mapping(Still):
-        def map(self, state: Any) -> Any:
+        def map(self, state):
             return {}["x"]
 
     failure = run_filter(Mapping("bad"), cs.simulate(world), world.belief).failure
@@ -177,18 +167,16 @@ def test_an_error_of_the_map_names_the_map(world: cs.Scenario) -> None:
 
 
 @pytest.mark.parametrize("entry", [(0, 0), (2, 1)])
-def test_a_covariance_that_is_not_finite_is_told_from_a_pose(
-    world: cs.Scenario, doomed: Control, entry: tuple[int, int]
-) -> None:
+def test_a_covariance_that_is_not_finite_is_told_from_a_pose(world, doomed, entry):
     P = np.eye(3)
     P[entry] = np.nan
     failure = run_filter(Still("bad", answers(covariance=P), doomed), cs.simulate(world, DOOMED), world.belief).failure
     assert (failure.step, failure.reason) == (STEP, "the pose covariance is not finite")
 
 
-def test_a_class_that_travels_by_value_has_the_file_it_came_from(world: cs.Scenario, doomed: Control) -> None:
+def test_a_class_that_travels_by_value_has_the_file_it_came_from(world, doomed):
     """Some versions of cloudpickle keep the name of the file, others write one of their own; the script has it."""
-    names: dict[str, Any] = {}
+    names = {}
     exec(compile("def act(*_):\n    raise KeyError('landmark 17')\n", "<dynamic-code>", "exec"), names)
     with Isolation([Script("bad", names["act"], doomed)], world.belief) as isolation:
         [said] = isolation.run(cs.simulate(world, DOOMED))
@@ -201,16 +189,14 @@ class Script(Still):
 
 
 @pytest.mark.parametrize("exception", [SystemExit("enough"), GeneratorExit("gone"), RuntimeError("x" * 10**6)])
-def test_what_a_filter_throws_is_a_result_in_any_process(
-    world: cs.Scenario, doomed: Control, exception: BaseException
-) -> None:
+def test_what_a_filter_throws_is_a_result_in_any_process(world, doomed, exception):
     failure = run_filter(Still("bad", raises(exception), doomed), cs.simulate(world, DOOMED), world.belief).failure
     assert failure.step == STEP
     assert failure.reason.startswith(f"{type(exception).__name__}: {str(exception)[:1000]}")
     assert len(failure.reason) < 1100
 
 
-def test_ctrl_c_in_this_process_is_ctrl_c(world: cs.Scenario, doomed: Control) -> None:
+def test_ctrl_c_in_this_process_is_ctrl_c(world, doomed):
     with pytest.raises(KeyboardInterrupt):
         run_filter(Still("bad", raises(KeyboardInterrupt()), doomed), cs.simulate(world, DOOMED), world.belief)
 
@@ -218,11 +204,11 @@ def test_ctrl_c_in_this_process_is_ctrl_c(world: cs.Scenario, doomed: Control) -
 class Cut(dict[str, Any]):
     """Ctrl-C comes while a run is taken in."""
 
-    def items(self) -> Any:
+    def items(self):
         raise KeyboardInterrupt
 
 
-def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario, doomed: Control) -> None:
+def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world, doomed):
     with Isolation([Still("bad", raises(RuntimeError("out of ideas")), doomed)], world.belief) as isolation:
         whole, cut = (
             (trial, isolation.run(trial)) for trial in (cs.simulate(world, run) for run in (DOOMED, DOOMED + 1))
@@ -238,7 +224,7 @@ def test_a_run_that_was_cut_off_leaves_nothing_and_others_all(world: cs.Scenario
     assert results.failures[["run", "step"]].to_numpy().tolist() == [[DOOMED, STEP]]
 
 
-def shouts(self: Still, _: Any) -> None:
+def shouts(self, _):
     for number in range(20000):
         print("out", number)
         print("err", number, file=sys.stderr)
@@ -249,9 +235,7 @@ def shouts(self: Still, _: Any) -> None:
 
 @pytest.mark.usefixtures("no_supervisors")
 @pytest.mark.parametrize("dies", [False, True])
-def test_what_a_filter_prints_is_bounded(
-    world: cs.Scenario, doomed: Control, capfd: pytest.CaptureFixture[str], dies: bool
-) -> None:
+def test_what_a_filter_prints_is_bounded(world, doomed, capfd, dies):
     loud = Still("loud", shouts, doomed, kept=[1] * dies)
     results = cs.run_trials(world, [Prints("quiet"), loud], runs=RUNS, jobs=1)
     assert len(results.failures) == dies
@@ -263,7 +247,7 @@ def test_what_a_filter_prints_is_bounded(
 
 
 class Prints(Still):
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         print("a word of quiet")
         return problem.start
 
@@ -271,19 +255,19 @@ class Prints(Still):
 class Counts(Still):
     """Each run says how many runs its object has seen."""
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         self.kept.append(1)
         return np.full(3, len(self.kept))
 
 
-def test_no_run_depends_on_those_before_it(world: cs.Scenario) -> None:
+def test_no_run_depends_on_those_before_it(world):
     results = [cs.run_trials(world, [Counts("counts")], runs=4, jobs=jobs) for jobs in (1, 2)]
     for result in results:
         assert (result.estimates["x"] == 1.0).all()
     pd.testing.assert_frame_equal(results[0].estimates, results[1].estimates, check_exact=True)
 
 
-def test_trials_that_differ_share_a_process(world: cs.Scenario) -> None:
+def test_trials_that_differ_share_a_process(world):
     """More steps than before have room, and nothing is left of what was said in an earlier trial."""
     short, long = (cs.simulate(world.variant(f"w{n}", truth__steps=n)) for n in (12, 60))
     blind = [
@@ -296,16 +280,16 @@ def test_trials_that_differ_share_a_process(world: cs.Scenario) -> None:
             [said], expected = isolation.run(trial), run_filter(Still("calm"), trial, world.belief)
             assert said.failure is None
             for name in ("pose", "covariance", "nis", "nis_dof"):
-                np.testing.assert_array_equal(getattr(said, name), getattr(expected, name))
+                assert_array_equal(getattr(said, name), getattr(expected, name))
 
 
 # --- killed from outside ---------------------------------------------------------------------------
 
 
-def kills_once(folder: Path) -> Callable[..., None]:
+def kills_once(folder):
     """SIGKILL as if from outside; ``folder`` has a file for each process that came to it."""
 
-    def act(*_: Any) -> None:
+    def act(*_):
         (folder / str(os.getpid())).touch()
         if len(list(folder.iterdir())) == 1:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -314,7 +298,7 @@ def kills_once(folder: Path) -> Callable[..., None]:
     return act
 
 
-def test_a_killed_worker_costs_nothing(world: cs.Scenario, doomed: Control, calm: pd.DataFrame, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_nothing(world, doomed, calm, tmp_path):
     results = cs.run_trials(world, [Still("bad", kills_once(tmp_path), doomed)], runs=RUNS, jobs=2)
     assert len(list(tmp_path.iterdir())) == 2
     assert len(results.failures) == 0
@@ -328,13 +312,13 @@ def test_a_killed_worker_costs_nothing(world: cs.Scenario, doomed: Control, calm
 class Threads(Still):
     """Says how many threads BLAS has in its process."""
 
-    def init(self, problem: Any) -> Any:
+    def init(self, problem):
         counts = [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
         return np.array([max(counts), 0.0, 0.0])
 
 
 @pytest.fixture
-def no_supervisors() -> Iterator[None]:
+def no_supervisors():
     """New ones, and those of before set aside: starting one takes a second or more."""
     before = filter_process._idle[:]
     filter_process._idle.clear()
@@ -344,17 +328,17 @@ def no_supervisors() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("no_supervisors")
-def test_blas_has_one_thread(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blas_has_one_thread(world, monkeypatch):
     for library in ("OPENBLAS_NUM", "MKL_NUM", "OMP_NUM", "BLIS_NUM", "VECLIB_MAXIMUM"):
         monkeypatch.setenv(f"{library}_THREADS", "2")
     results = cs.run_trials(world, [Threads("threads")], runs=1, jobs=1)
     assert (results.estimates["x"] == 1.0).all()
 
 
-def hangs(folder: Path) -> Callable[..., None]:
+def hangs(folder):
     """Leaves its process number in ``folder``, and does not end."""
 
-    def act(*_: Any) -> None:
+    def act(*_):
         (folder / str(os.getpid())).touch()
         while True:
             pass
@@ -363,10 +347,10 @@ def hangs(folder: Path) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_ends_what_hangs(world: cs.Scenario, doomed: Control, tmp_path: Path, jobs: int) -> None:
+def test_ctrl_c_ends_what_hangs(world, doomed, tmp_path, jobs):
     """What is finished is handed over, and no process is left."""
 
-    def interrupt() -> None:
+    def interrupt():
         while not list(tmp_path.iterdir()):
             time.sleep(0.05)
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
@@ -404,7 +388,7 @@ cs.run_trials(world, [Mine()], runs=2, jobs=1)
 """
 
 
-def test_a_filter_that_hangs_ends_with_the_study(tmp_path: Path) -> None:
+def test_a_filter_that_hangs_ends_with_the_study(tmp_path):
     """A script without a guard on ``__main__`` is killed: its standard error is closed when all its processes are."""
     (tmp_path / "mine.py").write_text(SCRIPT)
     process = subprocess.Popen([sys.executable, "mine.py"], cwd=tmp_path, stderr=subprocess.PIPE)
@@ -420,13 +404,13 @@ def test_a_filter_that_hangs_ends_with_the_study(tmp_path: Path) -> None:
 # --- refused ---------------------------------------------------------------------------------------
 
 
-def test_a_filter_that_cannot_be_pickled_is_refused(world: cs.Scenario) -> None:
+def test_a_filter_that_cannot_be_pickled_is_refused(world):
     with pytest.raises(cs.InputError, match=r"'lock' runs in a process of its own and cannot be pickled.*init"):
         cs.run_trials(world, [Still("lock", kept=[threading.Lock()])], runs=1, jobs=1)
 
 
 @pytest.mark.usefixtures("no_supervisors")
-def test_a_worker_of_a_pool_is_refused(world: cs.Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_of_a_pool_is_refused(world, monkeypatch):
     """A daemonic process can start no other."""
     monkeypatch.setitem(vars(multiprocessing.current_process())["_config"], "daemon", True)
     with pytest.raises(cs.InputError, match=r"worker of multiprocessing.Pool cannot start; use"):
@@ -435,17 +419,17 @@ def test_a_worker_of_a_pool_is_refused(world: cs.Scenario, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("option", ["timeout", "memory"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-def test_limits_are_positive(world: cs.Scenario, option: str, value: float) -> None:
+def test_limits_are_positive(world, option, value):
     with pytest.raises(cs.InputError, match=f"{option} must be positive, got"):
         cs.run_trials(world, ["ekf-xyz"], runs=1, jobs=1, **{option: value})  # type: ignore[call-overload]
 
 
-def takes_most(*_: Any) -> None:
+def takes_most(*_):
     np.ones(int(0.75 * MEMORY * 2**27))
 
 
 @pytest.mark.parametrize("run", [0, DOOMED])
-def test_a_filter_within_its_limits_has_the_same_bits(world: cs.Scenario, calm: pd.DataFrame, run: int) -> None:
+def test_a_filter_within_its_limits_has_the_same_bits(world, calm, run):
     """Also in the first trial of a new process, where libraries take memory that is not the filter's."""
     filter_process.dismiss()
     filters = [Still("calm", takes_most, cs.simulate(world, run).control(1)), "ekf-xyz"]

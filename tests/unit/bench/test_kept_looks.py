@@ -1,11 +1,7 @@
 """Runs until decided and runs of a log, on a journal: whatever ends them, a resume gives the bytes of one go."""
 
-from __future__ import annotations
-
 import json
 import weakref
-from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
@@ -19,36 +15,36 @@ from consistency.bench.runs.run_outcome import RunOutcome
 from consistency.bench.runs.run_until_decided import run_until_decided
 from consistency.bench.store.journal import Unfinished
 from consistency.bench.store.recorded_log import read_log
-from consistency.bench.store.results import StoredResults, open_results
+from consistency.bench.store.results import open_results
 from consistency.diagnostics import Record
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.document.judged_filters import document
 from consistency.referee.show.as_json import render
 
-OPEN: dict[str, Any] = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
+OPEN = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
 
 
 @pytest.fixture(scope="module")
-def world() -> cs.Scenario:
+def world():
     return cs.load_scenario("linear-gaussian").variant("short", truth__steps=40)
 
 
 @pytest.fixture(scope="module")
-def whole(world: cs.Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(world, tmp_path_factory):
     """Results of one go."""
     out = tmp_path_factory.mktemp("looks") / "whole"
     run_until_decided(world, ["kf"], out=out, **OPEN)
     return out
 
 
-def plan_in(folder: Path) -> Any:
+def plan_in(folder):
     return json.loads((folder / "manifest.json").read_text())["until_decided"]
 
 
 # --- until decided -----------------------------------------------------------------------------------
 
 
-def test_the_folder_is_that_of_a_plain_run_with_the_plan(world: cs.Scenario, whole: Path, tmp_path: Path) -> None:
+def test_the_folder_is_that_of_a_plain_run_with_the_plan(world, whole, tmp_path):
     results, verdicts = run_until_decided(world, ["kf"], **OPEN)
     cs.run_trials(world, ["kf"], runs=20, seed=3, jobs=1, out=tmp_path / "plain")
     assert content(whole) == content(tmp_path / "plain")
@@ -60,9 +56,7 @@ def test_the_folder_is_that_of_a_plain_run_with_the_plan(world: cs.Scenario, who
 
 
 @pytest.mark.parametrize("run", [5, 13, 19], ids=["before a look", "between looks", "the last"])
-def test_what_ends_the_process_takes_no_finished_run(
-    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, run: int
-) -> None:
+def test_what_ends_the_process_takes_no_finished_run(world, whole, tmp_path, stop_at, monkeypatch, run):
     with monkeypatch.context() as patch:
         patch.setattr(outcomes_to_results.Gathered, "results", None)  # as SIGKILL: nothing is written any more
         stop_at(run, RuntimeError("killed"))
@@ -80,12 +74,10 @@ def test_what_ends_the_process_takes_no_finished_run(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_killed_while_the_tables_are_written(
-    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_while_the_tables_are_written(world, whole, tmp_path, stop_at, monkeypatch):
     """All runs are there and decide: the resume writes them, and does none."""
 
-    def full(*_: Any, **__: Any) -> None:
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
@@ -101,15 +93,13 @@ def test_killed_while_the_tables_are_written(
 
 
 @pytest.mark.parametrize("look", [False, True])
-def test_ctrl_c_keeps_what_is_finished(
-    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, look: bool
-) -> None:
+def test_ctrl_c_keeps_what_is_finished(world, whole, tmp_path, stop_at, monkeypatch, look):
     """While runs are done, and while a look is taken after the last of them."""
     with monkeypatch.context() as patch:
         if look:
             look_at = judge_record.look
 
-            def pressed(design: Any, record: Record, spent: float | None) -> Any:
+            def pressed(design, record, spent):
                 if len(record.run_numbers) == 20:
                     raise KeyboardInterrupt
                 return look_at(design, record, spent)
@@ -128,12 +118,9 @@ def test_ctrl_c_keeps_what_is_finished(
     assert open_results(tmp_path / "out").manifest["complete"]
 
 
-@pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_another_plan_is_refused(
-    world: cs.Scenario, whole: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
-    stop_at(14, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
-    with pytest.raises(KeyboardInterrupt if how == "stopped" else RuntimeError):
+def test_another_plan_is_refused(world, whole, tmp_path, stop_at, monkeypatch):
+    stop_at(14, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
         run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
     monkeypatch.undo()
     for change in ({"max_runs": 21}, {"false_alarm": 1e-5}, {"detect": 1.06}, {"power": 0.9}):
@@ -143,7 +130,7 @@ def test_another_plan_is_refused(
     assert content(tmp_path / "out") == content(whole)
 
 
-def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_path: Path) -> None:
+def test_a_plain_run_goes_on_until_decided(world, whole, tmp_path):
     """More runs than the first looks take are there: a look sees its own only, so that what it says is the same."""
     cs.run_trials(world, ["kf"], runs=17, seed=3, jobs=1, out=tmp_path / "out")
     run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
@@ -153,10 +140,10 @@ def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_
         cs.run_trials(world, ["kf"], runs=runs, seed=3, jobs=1, out=tmp_path / str(runs))
         with pytest.raises(cs.InputError, match=message):
             run_until_decided(world, ["kf"], out=tmp_path / str(runs), resume=True, **one)
-    runs_seen: list[int] = []
+    runs_seen = []
     read = deciding.record_of
 
-    def seen(tables: Any, name: str, steps: int) -> Record:
+    def seen(tables, name, steps):
         runs_seen.append(len(tables.runs_of(name)))
         return read(tables, name, steps)
 
@@ -168,23 +155,9 @@ def test_a_plain_run_goes_on_until_decided(world: cs.Scenario, whole: Path, tmp_
     assert verdicts["kf"].runs == 20
 
 
-def test_two_filters_on_disk_are_those_in_memory(world: cs.Scenario, uvd: cs.Scenario, tmp_path: Path) -> None:
-    """One is decided before the other; maps and failures are there."""
-    options = {"max_runs": 14, "seed": 5, "jobs": 2}
-    memory, said = run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], **options)
-    assert isinstance(memory, cs.Results)
-    stored, verdicts = run_until_decided(uvd, ["ekf-uvd", "ekf-xyz"], out=tmp_path / "out", **options)
-    assert isinstance(stored, StoredResults)
-    memory.write(tmp_path / "memory")
-    assert content(tmp_path / "out") == content(tmp_path / "memory")
-    assert render(document(verdicts)) == render(document(said))
-
-
-def test_a_look_holds_one_filter_and_no_outcome(
-    uvd: cs.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    records: weakref.WeakSet[Any] = weakref.WeakSet()
-    outcomes: weakref.WeakSet[Any] = weakref.WeakSet()
+def test_a_look_holds_one_filter_and_no_outcome(uvd, tmp_path, monkeypatch):
+    records = weakref.WeakSet()
+    outcomes = weakref.WeakSet()
     most, read, add = [0, 0], deciding.record_of, outcomes_to_results.Gathered.add
 
     class Counted(RunOutcome):
@@ -193,13 +166,13 @@ def test_a_look_holds_one_filter_and_no_outcome(
     class Held(Record):
         __hash__ = object.__hash__
 
-    def held(*arguments: Any) -> Record:
+    def held(*arguments):
         record = Held(**vars(read(*arguments)))
         records.add(record)
         most[0] = max(most[0], len(records))
         return record
 
-    def counted(self: outcomes_to_results.Gathered, outcome: RunOutcome) -> None:
+    def counted(self, outcome):
         known = Counted(**vars(outcome))
         outcomes.add(known)
         most[1] = max(most[1], len(outcomes))
@@ -215,20 +188,19 @@ def test_a_look_holds_one_filter_and_no_outcome(
 
 
 @pytest.fixture
-def log(world: cs.Scenario, tmp_path: Path) -> Path:
+def log(world, tmp_path):
     simulate_log(world, 6, 4, tmp_path / "log")
     return tmp_path / "log"
 
 
-@pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_a_log_goes_on(log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+def test_a_log_goes_on(log, tmp_path, stop_at, monkeypatch):
     memory = run_log(read_log(log), ["kf"], jobs=1)
     memory.write(tmp_path / "memory")
     whole = run_log(read_log(log), ["kf"], jobs=2, out=tmp_path / "whole")
     assert content(tmp_path / "whole") == content(tmp_path / "memory")
     assert whole.manifest["log_sha256"] == memory.manifest["log_sha256"]
-    stop_at(4, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
-    with pytest.raises(KeyboardInterrupt if how == "stopped" else RuntimeError):
+    stop_at(4, RuntimeError("killed"))
+    with pytest.raises(RuntimeError):
         run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out")
     monkeypatch.undo()
     assert not (tmp_path / "out").exists()
@@ -238,12 +210,9 @@ def test_a_log_goes_on(log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pyt
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_another_log_is_refused(
-    world: cs.Scenario, log: Path, tmp_path: Path, stop_at: Any, monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
-    stop_at(4, KeyboardInterrupt() if how == "stopped" else RuntimeError("killed"))
-    with pytest.raises(KeyboardInterrupt if how == "stopped" else RuntimeError):
+def test_another_log_is_refused(world, log, tmp_path, stop_at, monkeypatch):
+    stop_at(4, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
         run_log(read_log(log), ["kf"], jobs=1, out=tmp_path / "out")
     monkeypatch.undo()
     simulate_log(world, 6, 5, tmp_path / "other")
@@ -255,7 +224,7 @@ def test_another_log_is_refused(
     assert open_results(tmp_path / "out").manifest["complete"]
 
 
-def test_a_log_whose_runs_are_not_numbered_from_zero(log: Path, tmp_path: Path, stop_at: Any) -> None:
+def test_a_log_whose_runs_are_not_numbered_from_zero(log, tmp_path, stop_at):
     for name in ("controls", "observations", "truth"):
         table = pd.read_parquet(log / f"{name}.parquet")
         table[table["run"].isin([1, 4, 5])].to_parquet(log / f"{name}.parquet", index=False)

@@ -1,18 +1,16 @@
 """Runs are a function of (scenario, filter, seed, run) alone, and whatever a filter does is a result."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from misbehaving import Still, raises
+from misbehaving import Still
 
 import consistency as cs
 from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.store.results import joined
 from consistency.bench.types import Trial
 
 
@@ -52,29 +50,12 @@ def ten(uvd):
 # --- the same bits -------------------------------------------------------------------------------
 
 
-def test_number_of_workers_does_not_matter(uvd, ten):
-    assert equal(ten, cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2))
-
-
 def test_number_of_runs_does_not_matter(uvd, ten):
     more = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=15, seed=3, jobs=2)
     for name in ("estimates", "truth"):
         table = getattr(more, name)
         first = table[table["run"] < 10].reset_index(drop=True)
         pd.testing.assert_frame_equal(first, getattr(ten, name), check_exact=True)
-
-
-def test_filters_that_ran_apart_are_joined(uvd, ten):
-    parts = [cs.run_trials(uvd, [name], runs=10, seed=3, jobs=1) for name in ("ekf-uvd", "ekf-xyz")]
-    whole = joined(parts)
-    assert equal(whole, ten)
-    assert whole.filters == ten.filters
-
-
-def test_seed_matters(uvd, ten):
-    """Negative control of the tests above."""
-    other = cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=4, jobs=1)
-    assert not np.array_equal(other.estimates["x"], ten.estimates["x"])
 
 
 def test_an_untouched_process_gives_the_same_bits(xyz):
@@ -215,28 +196,6 @@ def test_stopped_and_resumed_gives_the_same_bits(uvd, ten, stop_at, monkeypatch,
     assert equal(resumed, ten)
     assert resumed.manifest["complete"]
     assert "finished_runs" not in resumed.manifest
-
-
-def test_resuming_keeps_failed_runs(xyz, stop_at, monkeypatch):
-    filters = [Still("breaks", raises(RuntimeError("out of ideas")), cs.simulate(xyz, 2, seed=1).control(1))]
-    whole = cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1)
-    stop_at(4, KeyboardInterrupt())
-    with pytest.raises(Interrupted) as stop:
-        cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1)
-    monkeypatch.undo()
-    resumed = cs.run_trials(xyz, filters, runs=6, seed=1, jobs=1, previous=stop.value.results)
-    assert len(whole.failures) == 1
-    assert equal(resumed, whole)
-
-
-def test_resuming_fills_gaps(uvd, ten):
-    """Workers do not finish in order: run 4 may be missing where run 7 is there."""
-    kept = {
-        name: table[~table["run"].isin([4, 8, 9])].reset_index(drop=True)
-        for name, table in (("estimates", ten.estimates), ("truth", ten.truth))
-    }
-    previous = replace(ten, **kept)
-    assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=2, previous=previous), ten)
 
 
 def test_resuming_what_is_complete_needs_no_compiler(uvd, ten, monkeypatch):

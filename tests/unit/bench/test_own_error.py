@@ -282,6 +282,8 @@ def test_joined_results_keep_errors_and_maps(uvd, results):
     assert whole.manifest["error"] == {"right": "right"}
     pd.testing.assert_frame_equal(whole.estimates, results.estimates, check_exact=True)
     pd.testing.assert_frame_equal(whole.map, results.map, check_exact=True)
+    pd.testing.assert_frame_equal(whole.truth, results.truth, check_exact=True)
+    assert whole.filters == results.filters
 
 
 def test_results_that_lack_the_columns_of_an_error(results, tmp_path):

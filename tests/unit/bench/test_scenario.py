@@ -176,10 +176,6 @@ BAD = {
     "disparity reversed": ((put("truth.sensor.disparity_px", [32.0, 1.0]),), r"disparity"),
     "true is not a number": ((put("truth.motion.sigma_v", True),), r"truth\.motion\.sigma_v"),
     "text is not a number": ((put("truth.motion.sigma_v", "0.1"),), r"truth\.motion\.sigma_v"),
-    "two mistakes": (
-        (put("truth.steps", -1), put("belief.motion.sigma_v", -1.0)),
-        r"'truth\.steps'.*; key 'belief\.motion\.sigma_v'",
-    ),
     "name inside": ((put("name", "other"),), r"'name': not allowed here"),
     "corner too round": (
         (

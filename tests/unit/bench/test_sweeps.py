@@ -384,12 +384,6 @@ def test_the_cost_is_the_least_of_three_by_turns(uvd, monkeypatch):
     assert microseconds == pytest.approx(1e6 * 0.04 / uvd.truth.steps)
 
 
-def test_the_cost_is_that_of_a_step(uvd):
-    cost, microseconds = cost_of("ekf-uvd", "ekf-uvd", uvd, 0)
-    assert cost == 1.0
-    assert 0.1 < microseconds < 1e4
-
-
 # --- the map ------------------------------------------------------------------------------------
 
 

@@ -49,9 +49,8 @@ def test_every_case_was_measured_with_all_its_gates():
             assert gates >= case.gates, (case, claim)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.question}-{row.world}-{row.ratio:.3g}-{row.runs}")
-def test_what_was_measured_keeps_the_promise(row):
-    assert kept(row)
+def test_what_was_measured_keeps_the_promise():
+    assert [row for row in ROWS if not kept(row)] == []
 
 
 def test_the_documentation_shows_it():

@@ -86,10 +86,9 @@ def test_without():
 """
 
 
-@pytest.mark.parametrize("workers", [[], ["-n", "2"]], ids=["one process", "xdist"])
-def test_gates_are_summed_up_and_written(session, workers):
+def test_gates_are_summed_up_and_written(session):
     make(session, THREE)
-    result = session.runpytest(*workers, "--consistency-report=gates.json", "--junitxml=junit.xml")
+    result = session.runpytest("--consistency-report=gates.json", "--junitxml=junit.xml")
     result.assert_outcomes(passed=3, failed=2)
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.stdout.fnmatch_lines(["E *ConsistencyError: assert_consistent: the estimator is overconfident*"])
@@ -193,7 +192,6 @@ def test_the_page_stands_alone(session):
         (["--consistency-report=gates.txt"], "must end in .html or .json or .md or .xml"),
         (["--consistency-report=nowhere/gates.json"], "nowhere does not exist; make it first"),
         (["--consistency-report=folder.json"], "is a folder"),
-        (["--consistency-runs=0"], "--consistency-runs must be at least 1, got 0"),
         (["--consistency-false-alarm=1.5"], "--consistency-false-alarm must lie between 0 and 1, got 1.5"),
         (["-o", "consistency_false_alarm=few"], "consistency_false_alarm must be a number, got 'few'"),
     ],

@@ -515,32 +515,12 @@ def test_of_innovations():
 # --- in a verdict ---------------------------------------------------------------------------------------
 
 
-def test_consistent_is_shown_and_nothing_else():
-    rng = np.random.default_rng(32)
-    many = verdict_on(independent(rng, 60, 10, 3), false_alarm=SURE)
-    assert many.status == "consistent"
-    assert many.equivalence.shown
-    narrow = verdict_on(independent(rng, 60, 10, 3), false_alarm=SURE, detect=1.001)
-    assert narrow.status == "undecided"
-    assert not narrow.equivalence.shown
-    assert narrow.faults == ()
-
-
 def test_a_single_honest_log_is_undecided():
     rng = np.random.default_rng(33)
     verdict = verdict_on(independent(rng, 1, 300, 3), false_alarm=SURE)
     assert verdict.status == "undecided"
     assert verdict.faults == ()
     assert "1 run does not show" in verdict.reasons[0]
-
-
-def test_nothing_is_shown_by_innovations_that_are_not_judged():
-    rng = np.random.default_rng(34)
-    nis, dof = rng.chisquare(2, (40, 50)), np.full((40, 50), 2)
-    assert judge(Record("f", nis=nis, nis_dof=dof), Settings(SURE)).status == "undecided"
-    optimal = judge(Record("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE))
-    assert optimal.status == "consistent"
-    assert judge(Record("f", nis=nis, nis_dof=dof, optimal_gain=True), Settings(SURE, 1.0001)).status == "undecided"
 
 
 def test_innovations_of_nearly_the_stated_size_are_tolerated():

@@ -48,7 +48,7 @@ def test_all_looks_cost_the_rate_once():
     assert 0.98 < sum(costs) < 1.0
 
 
-@pytest.mark.parametrize("max_runs", [1, 5, 11, 12, 13, 14, 15, 16, 20, 23, 24, 25, 30, 31, 47, 48, 49, 100, 1000])
+@pytest.mark.parametrize("max_runs", [1, 12, 13, 16, 24, 25, 47, 1000])
 def test_a_limit_on_runs_ends_with_a_look(max_runs):
     found = list(Design(3, max_runs=max_runs).inspections())
     runs = [n for n, _ in found]
@@ -64,10 +64,8 @@ def test_a_limit_on_runs_ends_with_a_look(max_runs):
     "options",
     [
         {"max_runs": 0},
-        {"max_runs": -3},
         {"dof": 0},
         {"detect": 1.0},
-        {"detect": -1.0},
         {"false_alarm": 0.0},
         {"power": 1.0},
     ],
@@ -115,7 +113,7 @@ def test_consistent_is_said_at_looks_only():
     design = Design(3, false_alarm=SURE)
     assert look(design, evidence, 0.05).status == "consistent"
     between = look(design, evidence, None)
-    assert between.status == "undecided"
+    assert (between.status, between.later) == ("undecided", True)
     assert between.reasons[0].startswith("undecided: no fault found in the scale; the other questions are asked at")
     assert between.faults == ()
 

@@ -123,6 +123,8 @@ def paired(other: Path, path: Path, option: str, kind: str = "file '{}' with .tx
     for file in (*trajectory_files(other), *table_files(other)):
         if file.stem == path.stem:
             return file
+    if (other / path.name).is_file():
+        return other / path.name
     what = f"holds no {kind.format(path.stem)} for {path}"
     raise InputError(f"{option} {other}: {what}; files of the two folders are paired by name")
 

@@ -96,19 +96,15 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     after = np.minimum(before + 1, last)
     gap = reference[after] - reference[before]
     inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
-    to_before = np.abs(times - reference[before])
-    to_after = np.abs(times - reference[after])
-    apart = np.minimum(to_before, to_after)
+    apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
     rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
     before = before[rows]
     after = after[rows]
     gap = gap[rows]
     inside = inside[rows]
     apart = apart[rows]
-    since = times[rows] - reference[before]
-    share = np.where(inside, since / np.where(gap > 0, gap, 1.0), 0.0)
-    later = ~inside & (to_after[rows] < to_before[rows])
-    start = values[np.where(later, after, before)]
+    share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
+    start = values[np.where(inside, before, nearest(times[rows], reference, before))]
     truth = _between(start, values[after], share, manifold)
     width = 2 if manifold == "planar" else 3
     bend = _bends(values[:, :width], before) * 4.0 * share * (1.0 - share)

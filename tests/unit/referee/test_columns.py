@@ -122,10 +122,12 @@ def test_the_time_of_a_file(names, clock):
 
 
 def test_nanoseconds_are_read_to_the_last_digit(tmp_path):
-    t = 1_403_715_273_262_142_976
-    (tmp_path / "a.csv").write_text(f"timestamp,a\n{t + 7},1\n{t + 150_000_131},2\n")
+    first = 1403715273262143016
+    last = 1403715273262144446
+    assert float(last) / 1e9 != last / 10**9
+    (tmp_path / "a.csv").write_text(f"timestamp,a\n{first},1\n{last},2\n")
     whole = with_clock(read_sheet(tmp_path / "a.csv"))
-    assert whole.data["t"].tolist() == [(t + 7) / 1e9, (t + 150_000_131) / 1e9]
+    assert whole.data["t"].tolist() == [first / 10**9, last / 10**9]
     turned = with_clock(read_sheet(tmp_path / "a.csv").rows(np.array([1, 0])))
     assert_allclose(turned.data["t"], whole.data["t"][::-1], atol=1e-6)
 

@@ -58,12 +58,14 @@ def test_matched_estimates_stand_beside_their_truth(rng):
 
 
 def test_pairs_keep_each_truth_with_its_estimate(rng):
-    found = replace(run_of(rng), by=np.arange(40.0)).matched()
+    found = replace(run_of(rng), by=np.arange(40.0), true_clock=np.arange(74.0)).matched(0.02)
     for kept in (np.array([3, 4, 9]), np.isin(np.arange(37), (3, 4, 9))):
         some = found.pairs(kept)
         assert_array_equal(some.by, [3, 4, 9])
         assert_array_equal(some.truth, found.truth[[3, 4, 9]])
         assert_array_equal(some.true_covariance, found.true_covariance[[3, 4, 9]])
+        for name in ("apart", "bend", "true_clock"):
+            assert_array_equal(getattr(some, name), getattr(found, name)[[3, 4, 9]])
         assert_array_equal(some.errors(), found.errors()[[3, 4, 9]])
     assert found.pairs(found.stated) is found
 

@@ -183,6 +183,18 @@ def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[
     return out
 
 
+def columns_of_axes(axes: Sequence[str], columns: Columns | None) -> dict[str, str]:
+    """What the file of ``columns`` calls the columns of components, by component."""
+    names = {}
+    for new, old in (columns or {}).items():
+        before, _, after = new.partition("*")
+        for axis in axes:
+            rest = axis[len(before) : len(axis) - len(after)]
+            if new.replace("*", rest) == axis:
+                names[axis] = old.replace("*", rest)
+    return names
+
+
 def _places(names: Sequence[str], old: str) -> dict[int, str]:
     """Places of the columns of a name, or of all that a ``*`` stands for, with what stands in its place."""
     if "*" not in old:

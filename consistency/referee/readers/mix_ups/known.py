@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
 from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
@@ -322,8 +321,7 @@ def _quaternions() -> Iterator[Guess]:
 def _headings() -> Iterator[Guess]:
     """Headings in degrees, of one file or of both, with their variances or without."""
     for of, names in OF.items():
-        fields: dict[str, Function] = dict.fromkeys(("estimate", "truth"), _wrapped)
-        fields |= dict.fromkeys(names, _radians)
+        fields: dict[str, Function] = dict.fromkeys(names, _radians)
         fine = "truth" not in names
         volume = 0.0 if fine else float(np.log(DEGREE))
         words = f"the headings of {of}{{}} are in degrees; multiply them by pi / 180".format
@@ -332,14 +330,9 @@ def _headings() -> Iterator[Guess]:
         yield Guess(words(" and their variances"), changed(**fields), fine=fine, volume=volume)
 
 
-def _radians(values: Array) -> Array:
+def _radians(poses: Array) -> Array:
     """Poses in the plane whose headings are in degrees, with headings in rad."""
-    return _wrapped(values * [1.0, 1.0, DEGREE])
-
-
-def _wrapped(values: Array) -> Array:
-    """Poses in the plane with headings within half a turn."""
-    return np.column_stack([values[:, :2], wrap(values[:, 2])])
+    return np.asarray(poses * [1.0, 1.0, DEGREE])
 
 
 def _units(width: int, angles: slice) -> Iterator[Guess]:

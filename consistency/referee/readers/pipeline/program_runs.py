@@ -395,7 +395,5 @@ def _end_of(p: Poses) -> tuple[float, str]:
 def _digest(found: Sequence[Estimator]) -> str:
     """Digest of the truth of a run."""
     p = found[0].runs[0]
-    digest = hashlib.sha256()
-    for array in (p.true_t, p.truth):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]
+    numbers = np.concatenate([p.true_t, p.truth.ravel()])
+    return hashlib.sha256(numbers.tobytes()).hexdigest()[:16]

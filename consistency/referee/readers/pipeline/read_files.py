@@ -30,6 +30,7 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
+from consistency.referee.readers.formats.spellings import columns_of_axes
 from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
@@ -37,7 +38,7 @@ from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
-IN_COLUMNS = ("so2", "so3", "so3-body", "vector", "additive")  # errors of positions and velocities are in the world
+IN_COLUMNS = ("so2", "so3", "so3-body", "vector", "additive")  # differences of columns of positions and velocities
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": ", whose covariance is of a declared error too",
@@ -324,20 +325,10 @@ def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
 
 
 def own_names(record: Record, r: Reading) -> dict[str, str]:
-    """What the columns of ``--columns`` are called whose errors are those of components, by component.
-
-    There are none where the error is not a difference of columns: in the body, of motions, or after an alignment.
-    """
+    """What ``--columns`` calls components whose errors are differences of columns; none of others, as in the body."""
     if record.convention not in IN_COLUMNS or record.window is not None or r.align is not None:
         return {}
-    names = {}
-    for new, old in (r.columns or {}).items():
-        before, _, after = new.partition("*")
-        for axis in record.axes:
-            rest = axis[len(before) : len(axis) - len(after)]
-            if new.replace("*", rest) == axis:
-                names[axis] = old.replace("*", rest)
-    return names
+    return columns_of_axes(record.axes, r.columns)
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
@@ -347,8 +338,7 @@ def _by_kind(estimates: Path, r: Reading) -> list[Record]:
         of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
         notes.insert(0, f"{r.truth}: {of}")
     if any(notes):
-        first = records[0]
-        records[0] = replace(first, notes=(*filter(None, notes), *first.notes))
+        records[0] = replace(records[0], notes=(*filter(None, notes), *records[0].notes))
     return records
 
 

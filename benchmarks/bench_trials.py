@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import consistency as cs
-from consistency.bench.filters.compiled import problem_of
+from consistency.bench.filters.filter_declarations import problem_of
 from consistency.bench.models import point, stereo
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.scenario import Belief

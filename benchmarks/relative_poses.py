@@ -24,8 +24,9 @@ from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
 from consistency.referee.geometry.lie_groups import composed, propagated, to_left, vectors
-from consistency.referee.readers.pipeline.relative_motions import Stretch, relative_recording
+from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places
+from consistency.referee.readers.truth_matching import Manifold, Poses
 from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import judge_all
@@ -84,19 +85,26 @@ def drive(rng: np.random.Generator, group: str, steps: int, ratio: float = 1.0, 
     return Log(group, motions, truth, np.broadcast_to(covariance, (steps, n, n)))
 
 
-def motion_stretch(log: Log, run: int = 0) -> Stretch:
+def motion_stretch(log: Log, run: int = 0) -> Poses:
     """The log as a file of motions, with their covariances in the default convention."""
     kind, start = DECLARED[log.group], np.eye(log.truth.shape[-1])[None]
     P = propagated(np.linalg.inv(to_left(log.motions, kind)), log.covariance)
-    rows = np.arange(len(log.truth))
-    return Stretch(
-        run, "motions", Places(lambda row: f"row {row}", rows), DT * rows,
-        vectors(np.concatenate([start, log.motions])), np.concatenate([np.zeros((1, *P.shape[1:])), P]), None, rows,
-        vectors(log.truth), kind,
-    )  # fmt: skip
+    estimate = vectors(np.concatenate([start, log.motions]))
+    covariance = np.concatenate([np.zeros((1, *P.shape[1:])), P])
+    return _run("motions", DT * np.arange(len(log.truth)), estimate, covariance, vectors(log.truth), kind, run)
 
 
-def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, ratio: float, run: int) -> Stretch:
+def _run(
+    file: str, t: Array, estimate: Array, P: Array, truth: Array, kind: str, run: int, cross: Array | None = None
+) -> Poses:
+    """Rows with their truth beside them."""
+    place = Places(lambda row: f"row {row}", np.arange(len(t)))
+    manifold: Manifold = "planar" if P.shape[-1] == 3 else "spatial"
+    stated = np.ones(len(t), bool)
+    return Poses(place, t, estimate, P, stated, t, truth, manifold, kind, 0.0, cross, run=run, files=(file, file))
+
+
+def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, ratio: float, run: int) -> Poses:
     """A log of poses ``apart`` steps from each other that err by a stationary process, with cross-covariances."""
     log = drive(rng, group, poses * apart)
     T, S = log.truth[apart::apart], log.covariance[0]
@@ -108,14 +116,11 @@ def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, r
     J = np.linalg.inv(to_left(T, DECLARED[group]))
     cross = np.full((poses, *S.shape), np.nan)
     cross[1:] = J[:-1] @ (MEMORY * S) @ np.swapaxes(J[1:], 1, 2)
-    rows = np.arange(poses)
-    return Stretch(
-        run, "poses", Places(lambda row: f"row {row}", rows), DT * apart * rows, vectors(T), propagated(J, S), cross,
-        rows, vectors(truth), DECLARED[group],
-    )  # fmt: skip
+    t = DT * apart * np.arange(poses)
+    return _run("poses", t, vectors(T), propagated(J, S), vectors(truth), DECLARED[group], run, cross)
 
 
-def recorded(stretches: list[Stretch], size: str, motions: bool) -> Record:
+def recorded(stretches: list[Poses], size: str, motions: bool) -> Record:
     """Windows as ``consistency analyse --relative`` takes them."""
     axes = AXES["SE(2)" if stretches[0].d == 2 else "SE(3)"]
     relative = relative_of(size, motions)

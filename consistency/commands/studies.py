@@ -38,9 +38,10 @@ def simulate_command(
     """Simulate a scenario, and write it as a log. A log has truth, controls and observations, for any filter."""
     from consistency.bench.runs.montecarlo import simulate_log
     from consistency.bench.scenario import load_scenario
+    from consistency.referee.diagnostics.words.numbers import plural
 
     simulate_log(load_scenario(scenario), runs, seed, out, overwrite, form)
-    count = f"{runs} run{'s' * (runs != 1)}"
+    count = plural(runs, "run")
     print(f"{count} of {scenario} in {out}; filter them with: consistency run --log {out} --filter F")
 
 

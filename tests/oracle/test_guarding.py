@@ -10,8 +10,9 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.compiled import Compiled, problem_of
+from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Kernel
+from consistency.bench.filters.filter_declarations import problem_of
 from consistency.bench.filters.guard import kernel_guard, plain_rules
 from consistency.bench.filters.guard.kernel_guard import guard_part, keep_agreeing
 from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of

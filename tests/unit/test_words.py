@@ -588,7 +588,7 @@ def test_innovations_of_a_declared_gain_count(rng):
     size = f"innovations larger than stated (NIS per degree of freedom {short(verdict.innovations.ratio)})"
     assert verdict.reasons[0] == f"inconsistent: {size}"
     only = judge(Record("f", optimal_gain=True, **nis), Settings(SURE))
-    assert only.reasons[0] == f"overconfident: {size}; without truth most pose errors cannot be seen"
+    assert only.reasons[0] == f"overconfident: {size}; no truth: most pose errors cannot be seen"
     u = independent(rng, 60, 20, 2)
     u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
     correlated = judge(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -15,6 +14,7 @@ from threadpoolctl import ThreadpoolController
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
+from consistency.bench.filters.filter_declarations import is_realisable, problem_for
 from consistency.bench.filters.guard.guarded import Guarded
 from consistency.bench.filters.guard.kernel_guard import guard_part
 from consistency.bench.filters.guard.plain_rules import KINDS
@@ -23,7 +23,7 @@ from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark
 from consistency.bench.filters.kernel.update_steps import REASONS
 from consistency.bench.filters.parts.local import LOCAL_FROM, Local
 from consistency.bench.filters.parts.parking import Parking
-from consistency.bench.protocols import Filter, Problem, TrialTruth
+from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.errors import InputError
@@ -193,36 +193,3 @@ def variants(
     """
     plain = {s: textbook(f"{method}-{s}", uvd=s == "uvd") for s in suffixes.split()}
     return {each.name: Compiled(each, parts, SENSORS[s], **changes) for s, each in plain.items()}
-
-
-def problem_of(trial: Trial, belief: Belief) -> Problem:
-    """What a filter is told before step 1 of ``trial``."""
-    return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)
-
-
-def is_realisable(filter_: Any) -> bool:
-    """False for a filter that declares itself a bound, to be told the truth."""
-    return getattr(filter_, "realisable", True) is not False
-
-
-def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
-    """What this filter is told before step 1 of ``trial``: the truth too, if it is not realisable without.
-
-    Raises
-    ------
-    InputError
-        It needs the truth, and the trial has none, or has observations of what is not a landmark.
-    """
-    problem = problem_of(trial, belief)
-    if is_realisable(filter_):
-        return problem
-    name = getattr(filter_, "name", type(filter_).__name__)
-    needs = f"filter '{name}' is a bound that takes its Jacobians at the truth"
-    if trial.truth is None or trial.landmarks is None:
-        missing = "truth.parquet" if trial.truth is None else "landmarks.parquet"
-        raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
-    if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
-        raise InputError(
-            f"{needs}: run {trial.run} has observations of things that are not landmarks; leave the filter out"
-        )
-    return replace(problem, truth=TrialTruth(trial.truth, trial.landmarks))

@@ -1,13 +1,16 @@
-"""What a filter declares of itself: name, error, sensors; and whether that fits a belief."""
+"""What a filter declares of itself: name, error, sensors; whether that fits a belief; what it is told before step 1."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from consistency.bench.filters import filter_names, get_filter, usable_names
-from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.protocols import Filter, Problem, TrialTruth, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.scenario.tables.toml_tables import UNITS
+from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.parsing import require_name
@@ -87,3 +90,36 @@ def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | 
                 place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
                 raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
     return instances
+
+
+def is_realisable(filter_: Any) -> bool:
+    """False for a filter that declares itself a bound, to be told the truth."""
+    return getattr(filter_, "realisable", True) is not False
+
+
+def problem_of(trial: Trial, belief: Belief) -> Problem:
+    """What a filter is told before step 1 of ``trial``."""
+    return Problem(belief, trial.start, trial.landmarks if belief.sensor.model == "linear" else None)
+
+
+def problem_for(filter_: Any, trial: Trial, belief: Belief) -> Problem:
+    """What this filter is told before step 1 of ``trial``: the truth too, if it is not realisable without.
+
+    Raises
+    ------
+    InputError
+        It needs the truth, and the trial has none, or has observations of what is not a landmark.
+    """
+    problem = problem_of(trial, belief)
+    if is_realisable(filter_):
+        return problem
+    name = getattr(filter_, "name", type(filter_).__name__)
+    needs = f"filter '{name}' is a bound that takes its Jacobians at the truth"
+    if trial.truth is None or trial.landmarks is None:
+        missing = "truth.parquet" if trial.truth is None else "landmarks.parquet"
+        raise InputError(f"{needs}: run {trial.run} has none; a log needs {missing}, or leave the filter out")
+    if len(trial.landmark) and trial.landmark.max() >= len(trial.landmarks):
+        raise InputError(
+            f"{needs}: run {trial.run} has observations of things that are not landmarks; leave the filter out"
+        )
+    return replace(problem, truth=TrialTruth(trial.truth, trial.landmarks))

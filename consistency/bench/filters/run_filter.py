@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.filters.compiled import problem_for
-from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
+from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, rejects
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief

@@ -100,10 +100,10 @@ def _regions(regime: Regime) -> list[Chapter]:
 def consistent_cells_sentence(regime: Regime) -> str:
     """Which filter is consistent in how many cells, in one paragraph."""
     cells = regime.sweep.cells
-    consistent_cells = {
-        name: sum(r.status == "consistent" for (_, n), r in regime.results.items() if n == name)
-        for name in regime.sweep.filters
-    }
+    consistent_cells = dict.fromkeys(regime.sweep.filters, 0)
+    for (_, name), result in regime.results.items():
+        if name in consistent_cells:
+            consistent_cells[name] += result.status == "consistent"
     parts = [f"{name} in {count}" for name, count in sorted(consistent_cells.items(), key=lambda pair: -pair[1])]
     alone = sum(bool(regime.trusted(cell)) for cell in cells)
     text = f"Of {len(cells)} cells, consistent are {names_in_a_row(parts)}. In {alone} of them at least one filter is."

@@ -106,10 +106,8 @@ class Gathered:
         manifest = manifest | {"failures": len(failures)}
         if self.new is not None and self.finished:
             return away_from_signals(self._stored, self.new, manifest, failures, landmarks, rejections)
-        estimates, maps = (
-            [(name, columns) for name in self.filters for columns in self.pieces(table, name)]
-            for table in ("estimates", "map")
-        )
+        estimates = [(name, columns) for name in self.filters for columns in self.pieces("estimates", name)]
+        maps = [(name, columns) for name in self.filters for columns in self.pieces("map", name)]
         truth = [("", columns) for columns in self.pieces("truth")]
         return Results(
             stacked_table("estimates", estimates, tuple(OPTIONAL["estimates"]) if self.errors else ()), failures,

@@ -169,12 +169,12 @@ def _selection(
     if unknown := [name for name in only if name not in known_findings]:
         known = ", ".join([*known_findings, *scripts])
         raise InputError(f"--only {unknown[0]}: no such finding or experiment; known: {known}")
-    scripts_and_findings = [
-        (module, [name for name in module.FINDINGS if not only or name in only])
-        for module in scripts.values()
-        if only or long or not getattr(module, "LONG", False)
-    ]
-    return [(module, ids) for module, ids in scripts_and_findings if ids]
+    selection = []
+    for module in scripts.values():
+        ids = [name for name in module.FINDINGS if not only or name in only]
+        if ids and (only or long or not getattr(module, "LONG", False)):
+            selection.append((module, ids))
+    return selection
 
 
 def _findings_of(study: Study, selection: Sequence[tuple[ModuleType, Sequence[str]]]) -> list[Finding]:

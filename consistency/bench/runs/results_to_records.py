@@ -23,7 +23,8 @@ from consistency.referee.diagnostics.records.record import JointNees, MapRecord,
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line
-from consistency.referee.readers.formats.innovation_files import NisLog, checked_dof, choose
+from consistency.referee.readers.formats.innovation_files import NisLog, choose
+from consistency.referee.readers.formats.sheet import checked_dof
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.judge_sources import Source
 

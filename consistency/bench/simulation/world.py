@@ -133,7 +133,11 @@ class World:
         # noise on the odometry leaves the path as planned, and a linear world looks from it
         self.undisturbed = not self.linear and truth.motion.noise_on != "motion"
         self._chain = EffectChain(effects_of(truth.sensor))
-        self._number = 1 if self.linear else self._chain.leading() if self.undisturbed else 0
+        self._number = 0
+        if self.linear:
+            self._number = 1
+        elif self.undisturbed:
+            self._number = self._chain.leading()
         self._shared = self._chain.shared(self.context(self.reference), self._number) if self._number else None
         if self._shared is not None and self.undisturbed:
             _ = self._shared.z  # now, and not in several threads at once

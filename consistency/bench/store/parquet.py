@@ -76,14 +76,15 @@ class Writer:
         An optional column that is not among them is null.
         """
         rows = len(next(iter(columns.values())))
-        arrays = [
-            pa.repeat(pa.scalar(constant[field.name], field.type), rows)
-            if field.name in constant
-            else pa.array(columns[field.name], field.type, from_pandas=True)
-            if field.name in columns or field.name not in self.optional
-            else pa.nulls(rows, field.type)
-            for field in self.schema
-        ]
+        arrays = []
+        for field in self.schema:
+            if field.name in constant:
+                array = pa.repeat(pa.scalar(constant[field.name], field.type), rows)
+            elif field.name in self.optional and field.name not in columns:
+                array = pa.nulls(rows, field.type)
+            else:
+                array = pa.array(columns[field.name], field.type, from_pandas=True)
+            arrays.append(array)
         self._pieces.append(pa.RecordBatch.from_arrays(arrays, schema=self.schema))
         self._rows += rows
         if self._rows >= ROWS:
@@ -251,7 +252,11 @@ def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) 
         values = pd.to_numeric(column, errors="coerce").to_numpy(float, na_value=np.nan)
     if column.name in NULLABLE:
         values = np.where(column.isna() | (values == np.inf) & (column.name in UNBOUNDED), 0.0, values)
-    largest = MOST_DOF - 1 if column.name == "nis_dof" else HUGE if path.stem in GIVEN else LARGEST_NUMBER
+    largest = LARGEST_NUMBER
+    if column.name == "nis_dof":
+        largest = MOST_DOF - 1
+    elif path.stem in GIVEN:
+        largest = HUGE
     is_allowed = np.abs(values) <= largest  # false of NaN
     if not is_allowed.all():
         row = int(np.argmin(is_allowed))

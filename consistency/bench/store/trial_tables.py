@@ -60,36 +60,23 @@ def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
 
 
 def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "run": np.full(t.steps, t.run),
-                    "step": np.arange(1, t.steps + 1),
-                    **dict(zip(["dt", "v", "omega"], t.controls.T, strict=True)),
-                }
-            )
-            for t in trials
-        ],
-        ignore_index=True,
-    )
+    tables = []
+    for trial in trials:
+        columns: Columns = {"run": np.full(trial.steps, trial.run), "step": np.arange(1, trial.steps + 1)}
+        columns |= dict(zip(["dt", "v", "omega"], trial.controls.T, strict=True))
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
 
 
 def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
     """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
-    has_sources = any(t.source is not None for t in trials)
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "run": np.full(len(t.landmark), t.run),
-                    "step": t.step,
-                    "landmark": t.landmark,
-                    **dict(zip(["z0", "z1", "z2"], t.z.T, strict=False)),
-                    **({"source": t.landmark if t.source is None else t.source} if has_sources else {}),
-                }
-            )
-            for t in trials
-        ],
-        ignore_index=True,
-    )
+    has_sources = any(trial.source is not None for trial in trials)
+    tables = []
+    for trial in trials:
+        columns: Columns = {"run": np.full(len(trial.landmark), trial.run), "step": trial.step}
+        columns["landmark"] = trial.landmark
+        columns |= dict(zip(["z0", "z1", "z2"], trial.z.T, strict=False))
+        if has_sources:
+            columns["source"] = trial.landmark if trial.source is None else trial.source
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)

@@ -288,7 +288,8 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    if worst := {name: axis for name, v in verdicts.items() if (axis := clear(v.worst_axis)) is not None}:
+    worst = {name: axis for name, v in verdicts.items() if (axis := clear(v.worst_axis)) is not None}
+    if worst and len(verdicts) > 1:  # the reasons of a single verdict have it
         texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, (axis, ratio) in worst.items())
         lines.append(f"ratio of the worst axis: {texts}")
     if maps := {name: v.map for name, v in verdicts.items() if v.map is not None}:

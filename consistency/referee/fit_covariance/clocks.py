@@ -36,7 +36,9 @@ class TimedMotions(NamedTuple):
         start, end = true[:, is_known]
         error = log(inverse(self.motions[is_known]) @ inverse(start) @ end)
         d = self.motions.shape[-1] - 1
-        return np.column_stack([np.square(error[:, :d]).sum(axis=1), np.square(error[:, d:]).sum(axis=1)])
+        positions = (error[:, :d] ** 2).sum(axis=1)
+        rotations = (error[:, d:] ** 2).sum(axis=1)
+        return np.column_stack([positions, rotations])
 
 
 def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
@@ -62,7 +64,8 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
         for rows in np.array_split(some, -(-PARTS // len(drives))):
             if len(rows):
                 ends = last[rows]
-                parts.append(TimedMotions(poses.of_rows(rows), poses.of_rows(ends), inverse(T[rows]) @ T[ends]))
+                motions = inverse(T[rows]) @ T[ends]
+                parts.append(TimedMotions(poses.of_rows(rows), poses.of_rows(ends), motions))
     if len(parts) > 1:
         offset = _best(parts)
         spread = float(np.std([_best([part]) for part in parts], ddof=1))

@@ -20,11 +20,20 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
-from consistency.referee.fit_covariance.factors import Block, Factors, Fit, blocks_of, fit_runs
+from consistency.referee.fit_covariance.factors import (
+    Block,
+    Factors,
+    Fit,
+    blocks_of,
+    fit_runs,
+    stated_errors,
+    steps_of_runs,
+)
 from consistency.referee.fit_covariance.intervals import mean_over_runs
+from consistency.referee.fit_covariance.likelihood import log_densities
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.judge_sources import judge_all
+from consistency.referee.verdicts.judge_sources import judge_all, source_of
 
 LEVELS = (0.68, 0.95, 0.99)
 ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
@@ -43,14 +52,13 @@ class HeldOut:
     @property
     def ratios(self) -> Array:
         """Ratio of true to stated covariance of each run, (R,); NaN of one without a step."""
-        assert self.record.nees is not None
-        means, counts = run_means(self.record.nees)
+        _, _, nees = stated_errors(self.record)
+        means, counts = run_means(nees)
         return np.where(counts > 0, means, np.nan) / self.record.dof
 
     def covered(self, levels: Sequence[float] | Array) -> Array:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
-        nees = self.record.nees
-        assert nees is not None
+        _, _, nees = stated_errors(self.record)
         bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
         return np.array([average(np.where(np.isfinite(nees), nees <= bound, np.nan)) for bound in bounds])
 
@@ -165,9 +173,9 @@ def correct(
             raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
         record = record_of_arrays({"errors": record, "covariances": covariances}, axes, "estimator", False)
     require_runs(record)
-    assert record.nees is not None
+    _, _, nees = stated_errors(record)
     labels = tuple(map(str, record.run_numbers if names is None else names))
-    counted = np.asarray(np.isfinite(record.nees).any(axis=1))
+    counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
     blocks = blocks_of(record.axes, record.dof, per_axis)
     fits = fit_groups(record.of_runs(fitted), blocks)
@@ -202,13 +210,13 @@ def the_record(records: Sequence[Record], name: str | None = None) -> Record:
     InputError
         There are several, or none of this name.
     """
-    found = [record for record in records if name in (None, record.name)]
-    if len(found) == 1:
-        return found[0]
-    what = "these files hold several estimators: name one by --filter"
+    source = source_of(records)
     if name is not None:
-        what = f"--filter {name}: is not in these files"
-    raise InputError(f"{what}; there are: {', '.join(record.name for record in records)}")
+        return source.record(name)
+    if len(source.filters) > 1:
+        there = ", ".join(source.filters)
+        raise InputError(f"these files hold several estimators: name one by --filter; there are: {there}")
+    return records[0]
 
 
 def require_runs(record: Record) -> None:
@@ -258,21 +266,21 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
 
     A group that fewer than two runs pass through has the fit of all steps.
     """
-    assert record.nees is not None
+    _, _, nees = stated_errors(record)
     fits = {}
     names = record.groups.names if record.groups is not None else ()
     whole = fit_runs(record, blocks)
     for number, name in enumerate(names):
-        nees = np.where(group_index(record) == number, record.nees, np.nan)
-        some = replace(record, nees=nees, groups=None)
-        there = np.isfinite(nees).any(axis=1)
+        of_group = np.where(group_index(record) == number, nees, np.nan)
+        some = replace(record, nees=of_group, groups=None)
+        there = np.isfinite(of_group).any(axis=1)
         if there.sum() < 2:
             fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
             continue
         fit = fit_runs(some.of_runs(np.flatnonzero(there)), blocks)
-        rows = np.where(there, np.cumsum(there) - 1, -1)
-        left_out = tuple(fit.left_out[row] if row >= 0 else fit.factors for row in rows)
-        fits[name] = replace(fit, left_out=left_out, notes=tuple(f"{name}: {note}" for note in fit.notes))
+        left_out = iter(fit.left_out)
+        of_runs = tuple(next(left_out) if is_there else fit.factors for is_there in there)
+        fits[name] = replace(fit, left_out=of_runs, notes=tuple(f"{name}: {note}" for note in fit.notes))
     return fits | {"": whole}
 
 
@@ -285,8 +293,8 @@ def are_needed(fits: Sequence[Fit]) -> bool:
 
 def group_index(record: Record) -> Indices:
     """The group of each step, (runs, steps), -1 where it is in none: the place of a fit among those of the groups."""
-    assert record.nees is not None
-    return np.full(record.nees.shape, -1) if record.groups is None else record.groups.index
+    _, _, nees = stated_errors(record)
+    return np.full(nees.shape, -1) if record.groups is None else record.groups.index
 
 
 def by_group(fits: Mapping[str, Fit], without: int | None = None) -> ByGroup:
@@ -298,30 +306,28 @@ def by_group(fits: Mapping[str, Fit], without: int | None = None) -> ByGroup:
 
 def with_factors(record: Record, used: Sequence[ByGroup]) -> Record:
     """The record with the covariances of each run corrected by its factors."""
-    assert record.covariance is not None
-    P = record.covariance.copy()
+    error, stated, _ = stated_errors(record)
+    P = stated.copy()
     for run, index in enumerate(group_index(record)):
         for number in np.unique(index):
             steps = index == number
             P[run, steps] = used[run][number].applied(P[run, steps])
-    return with_covariance(record, record.error, P)
+    return with_covariance(record, error, P)
 
 
 def excess_of(record: Record, blocks: Sequence[Block], dof: Array) -> float:
     """What the uncertainty of factors known with dof (groups, B) adds to a ratio, on average over runs."""
-    assert record.nees is not None
+    _, _, nees = stated_errors(record)
     sizes = np.array([len(block) for block in blocks])
     of_blocks = np.where(dof > 2.0, dof / np.maximum(dof - 2.0, 1e-9), np.inf)
     of_groups = (sizes * of_blocks).sum(axis=1) / sizes.sum()
-    steps = np.where(np.isfinite(record.nees), of_groups[group_index(record)], np.nan)
-    return average(steps)
+    return average(np.where(np.isfinite(nees), of_groups[group_index(record)], np.nan))
 
 
-def with_covariance(record: Record, error: Array | None, P: Array) -> Record:
+def with_covariance(record: Record, error: Array, P: Array) -> Record:
     """The record with other errors and covariances where it had some that count."""
-    assert error is not None
-    assert record.nees is not None
-    nees = np.where(np.isfinite(record.nees), squared_length(whiten(error, P)), np.nan)
+    _, _, stated = stated_errors(record)
+    nees = np.where(np.isfinite(stated), squared_length(whiten(error, P)), np.nan)
     return replace(record, error=error, covariance=P, nees=nees)
 
 
@@ -336,17 +342,17 @@ def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Rec
     ----------
     dof : (groups, B), nu of each block in each group
     """
-    assert record.error is not None
-    assert record.covariance is not None
-    error = record.error.copy()
+    stated, P, _ = stated_errors(record)
+    error = stated.copy()
     for block, of_groups in zip(blocks, dof.T, strict=True):
         nu = of_groups[group_index(record)]
         places, n = list(block.places), len(block)
-        squares = squared_length(whiten(error[..., places], block.of(record.covariance)))
+        squares = squared_length(whiten(error[..., places], block.of(P)))
         known = special.chdtri(n, special.fdtrc(n, nu, squares / n))
         shorter = np.sqrt(known / np.where(squares > 0, squares, 1.0))
-        error[..., places] *= np.where(np.isfinite(shorter) & (squares > 0), shorter, 1.0)[..., None]
-    return with_covariance(record, error, record.covariance)
+        is_known = np.isfinite(shorter) & (squares > 0)
+        error[..., places] *= np.where(is_known, shorter, 1.0)[..., None]
+    return with_covariance(record, error, P)
 
 
 def verdict_of(record: Record) -> Verdict:
@@ -356,19 +362,15 @@ def verdict_of(record: Record) -> Verdict:
 
 def held_out_by(record: Record) -> HeldOut:
     """Figures of runs beside the covariance of their record."""
-    assert record.nees is not None
-    assert record.covariance is not None
+    _, _, nees = stated_errors(record)
     verdict = verdict_of(record)
     if verdict.scale is not None:
         ratio = verdict.scale.inflation
     else:
-        means, counts = run_means(record.nees)
+        means, counts = run_means(nees)
         ratio = ratio_interval(means[counts > 0] / record.dof, record.dof)
-    counted = np.isfinite(record.nees)
-    P = np.where(counted[..., None, None], record.covariance, np.eye(record.dof))
-    density = -0.5 * (record.nees + np.linalg.slogdet(2.0 * np.pi * P)[1])
-    scores, counts = run_means(density)
-    return HeldOut(record, verdict, ratio, scores[counts > 0])
+    scores = [log_densities(error, P).mean() for error, P in steps_of_runs(record) if len(error)]
+    return HeldOut(record, verdict, ratio, np.array(scores))
 
 
 def average(values: Array) -> float:

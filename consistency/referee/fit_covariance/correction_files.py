@@ -12,6 +12,7 @@ from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
 from consistency.referee.fit_covariance.correction_text import data, sentence
+from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.page import correction_page
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
@@ -95,19 +96,16 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
     rows = np.flatnonzero(np.isin(record.run_numbers, list(of_runs)))
     some = record.of_runs(rows)
     used = [of_runs[run] for run in some.run_numbers.tolist()]
-    corrected = with_factors(some, used)
-    assert corrected.nees is not None
-    assert corrected.error is not None
-    assert corrected.covariance is not None
-    counted = np.isfinite(corrected.nees)
+    error, P, nees = stated_errors(with_factors(some, used))
+    counted = np.isfinite(nees)
     mask = ~counted
-    for failure in corrected.failures:  # which stay failures
-        mask[corrected.run_numbers == failure.run, failure.step - 1 :] = False
+    for failure in some.failures:  # which stay failures
+        mask[some.run_numbers == failure.run, failure.step - 1 :] = False
     axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
     np.savez(
         path,
-        errors=corrected.error,
-        covariances=np.where(counted[..., None, None], corrected.covariance, np.eye(record.dof)),
+        errors=error,
+        covariances=np.where(counted[..., None, None], P, np.eye(record.dof)),
         mask=mask,
         axes=axes,
     )
@@ -125,6 +123,7 @@ def pasted(found: Correction) -> str:
         place = f'FACTORS[f"{groups.column} is {{value}}"]'
         if groups.edges is not None:
             place = f"list(FACTORS.values())[bisect.bisect_left({list(groups.edges)}, value)]"
+    table = "".join(f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items())
     turn = "heading" if "heading" in found.axes else "yaw"
     order = ("x", "y", turn) if turn == "heading" else ("roll", "pitch", "yaw", "x", "y", "z")  # of Pose2, or Pose3
     return f'''"""Corrected covariances. {sentence(found)}."""
@@ -135,7 +134,7 @@ AXES = {found.axes}
 ROS = ("x", "y", "z", "roll", "pitch", "{turn}")
 GTSAM = {order}
 FACTORS = {{  # factor and floor on the variance of each component
-{_table_of_factors(found)}}}
+{table}}}
 
 
 def corrected(P{value}, axes=AXES):
@@ -163,9 +162,3 @@ def gtsam_noise(P{value}):
 
     return gtsam.noiseModel.Gaussian.Covariance(corrected(P{value}, axes=GTSAM))
 '''
-
-
-def _table_of_factors(found: Correction) -> str:
-    """Lines of the table of factors and floors by group and component."""
-    lines = [f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items()]
-    return "".join(lines)

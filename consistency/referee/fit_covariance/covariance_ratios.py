@@ -119,7 +119,10 @@ def folds_of(
         if is_judged.all() or not is_judged.any():
             raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
         since = [np.where(np.isin(every, judged), 0, NEVER)]
-    folds = [Fold(fit(windows.of(windows.last <= each[windows.drive])), each) for each in since]
+    folds = []
+    for each in since:
+        is_fitted = windows.last <= each[windows.drive]
+        folds.append(Fold(fit(windows.of(is_fitted)), each))
     if held_out in (None, HALF):
         return fit(windows), folds
     return folds[0].noise, folds

@@ -16,9 +16,9 @@ from consistency.referee.readers.formats.file_kinds import (
     TABLES,
     TRAJECTORIES,
     is_bag,
-    is_drive,
     is_plane,
     is_solution,
+    paired,
     trajectory_files,
     unknown_kind,
 )
@@ -143,13 +143,11 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
     for path in files:
-        truth = r.truth
-        if truth is not None and truth.is_dir() and not is_drive(truth):
-            truth = truth / path.name
-        if truth is not None and not truth.exists():
-            raise InputError(f"--truth {r.truth}: holds no file '{path.name}' for {path}")
+        own = r
+        if r.truth is not None:
+            own = replace(r, truth=paired(r.truth, path, "--truth", "table '{}'"))
         stem = path.name.split(".")[0]
-        for poses in _of_one(path, read_tables(path, replace(r, truth=truth), poses_alone=True), r):
+        for poses in _of_one(path, read_tables(path, own, poses_alone=True), r):
             found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
     return found
 

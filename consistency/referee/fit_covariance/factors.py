@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.intervals import (
     interval_of_ratio,
     mean_over_runs,
 )
-from consistency.referee.fit_covariance.likelihood import Score, log_densities, maximise, nonnegative, score_of
+from consistency.referee.fit_covariance.likelihood import Score, log_densities, maximise, nonnegative, score_of, solved
 from consistency.referee.types import Array, Indices
 
 KINDS = {
@@ -120,12 +120,17 @@ def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
     return tuple(Block(name, tuple(places)) for name, places in found.items())
 
 
-def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
-    """Errors (k, n) and stated covariances (k, n, n) of the steps of each run that count."""
+def stated_errors(record: Record) -> tuple[Array, Array, Array]:
+    """Errors (runs, steps, n), stated covariances and NEES (runs, steps) of a record that has them."""
     assert record.error is not None
     assert record.covariance is not None
     assert record.nees is not None
-    for error, P, nees in zip(record.error, record.covariance, record.nees, strict=True):
+    return record.error, record.covariance, record.nees
+
+
+def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
+    """Errors (k, n) and stated covariances (k, n, n) of the steps of each run that count."""
+    for error, P, nees in zip(*stated_errors(record), strict=True):
         there = np.isfinite(nees)
         yield error[there], P[there]
 
@@ -153,16 +158,22 @@ def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
         )
         return replace(both, notes=tuple(notes))
     notes.append(f"floors are 0: with them the held-out log score of a step is not shown to gain ({gain.value:+.2g})")
-    factors = zip(alone.factor, both.factor, strict=True)
-    intervals = (Interval(a.value, min(a.value, b.low), max(a.value, b.high)) for a, b in factors)
+    intervals = []
+    for factor, beside_floor in zip(alone.factor, both.factor, strict=True):
+        low = min(factor.value, beside_floor.low)
+        high = max(factor.value, beside_floor.high)
+        intervals.append(Interval(factor.value, low, high))
     floors = (each._replace(value=0.0, low=0.0) for each in both.floor)
     return replace(alone, factor=tuple(intervals), floor=tuple(floors), notes=tuple(notes))
 
 
 def held_out_scores(record: Record, fit: Fit) -> Array:
     """Log density of a step of each run by the fit of the others, (R,)."""
-    runs = zip(fit.left_out, steps_of_runs(record), strict=True)
-    return np.array([log_densities(error, factors.applied(P)).mean() for factors, (error, P) in runs])
+    found = []
+    for factors, (error, P) in zip(fit.left_out, steps_of_runs(record), strict=True):
+        densities = log_densities(error, factors.applied(P))
+        found.append(densities.mean())
+    return np.array(found)
 
 
 # --- factors alone ----------------------------------------------------------------------------------------------------
@@ -214,8 +225,9 @@ def fit_factors(Q: Array, sizes: Array) -> Array:
     for _ in range(ROUNDS):
         scaled = Q * x[..., :, None] * x[..., None, :]
         gradient = scaled.sum(axis=-1) - sizes
-        step = np.linalg.solve(scaled + np.diag(sizes), gradient[..., None])[..., 0]
-        decrement = np.sqrt(np.maximum((step * gradient).sum(axis=-1, keepdims=True), 0.0))
+        step = solved(scaled + np.diag(sizes), gradient)
+        squared = (step * gradient).sum(axis=-1, keepdims=True)
+        decrement = np.sqrt(np.maximum(squared, 0.0))
         x = x * (1.0 - step / np.where(decrement < FAR, 1.0, 1.0 + decrement))
         if decrement.max() < CLOSE:
             break
@@ -239,13 +251,20 @@ def likeness(record: Record, block: Block) -> float:
     1 where each covariance is the same multiple of the identity.
     """
     stated = [block.of(P) for _, P in steps_of_runs(record)]
-    squares = [np.square(np.linalg.inv(P)).sum(axis=(1, 2)).mean() for P in stated]
+    squares = []
+    for P in stated:
+        inverse = np.linalg.inv(P)
+        squares.append((inverse**2).sum(axis=(1, 2)).mean())
     return float(len(block) * mean_precision(stated) ** 2 / np.mean(squares))
 
 
 def mean_precision(covariances: Sequence[Array]) -> float:
     """Mean over runs, steps and components of the diagonal of P^-1, of covariances (k, n, n) of each run."""
-    return float(np.mean([np.diagonal(np.linalg.inv(P), axis1=1, axis2=2).mean() for P in covariances]))
+    means = []
+    for P in covariances:
+        precisions = np.diagonal(np.linalg.inv(P), axis1=1, axis2=2)
+        means.append(precisions.mean())
+    return float(np.mean(means))
 
 
 def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
@@ -265,7 +284,7 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     _, g, H = scores(record, blocks, free, theta)
     others_g, others_H = g.sum(axis=0) - g, H.sum(axis=0) - H  # of all runs but one
     open_value = theta + np.linalg.solve(H.sum(axis=0), g.sum(axis=0))  # which may lie below 0
-    open_left_out = theta + np.linalg.solve(others_H, others_g[..., None])[..., 0]
+    open_left_out = theta + solved(others_H, others_g)
     targets = zip(others_H, others_g + others_H @ theta, strict=True)
     left_out = [with_parameters(blocks, free, np.maximum(nonnegative(*target), least)) for target in targets]
     intervals = []
@@ -313,7 +332,8 @@ def derivatives(C: Array, factors: Factors, free: Indices) -> Array:
     scaled = C - np.diag(factors.of_components()[1])
     by_factor = (rates[:, :, None] + rates[:, None, :]) * scaled[:, None]
     by_floor = own[free, :, None] * np.eye(n)
-    return np.concatenate([by_factor, np.broadcast_to(by_floor, (len(C), *by_floor.shape))], axis=1)
+    by_floor = np.broadcast_to(by_floor, (len(C), *by_floor.shape))
+    return np.concatenate([by_factor, by_floor], axis=1)
 
 
 def relative_sizes(record: Record, whole: Factors, others: Sequence[Factors]) -> Array:

@@ -88,5 +88,6 @@ def mean_over_runs(values: Array) -> Interval:
     mean = float(values.mean())
     if len(values) < 2:
         return Interval(mean, float("nan"), float("nan"))
-    reach = student(len(values)) * float(values.std(ddof=1)) / float(np.sqrt(len(values)))
+    error = float(values.std(ddof=1) / np.sqrt(len(values)))
+    reach = student(len(values)) * error
     return Interval(mean, mean - reach, mean + reach)

@@ -21,14 +21,20 @@ class Score(NamedTuple):
     information: Array  # (p, p), expected
 
 
+def solved(A: Array, b: Array) -> Array:
+    """x of A x = b, of matrices A (..., n, n) and vectors b (..., n)."""
+    return np.linalg.solve(A, b[..., None])[..., 0]
+
+
 def nees_of(error: Array, C: Array) -> Array:
     """e' C^-1 e of errors (K, n) and covariances (K, n, n), (K,)."""
-    return np.asarray((error * np.linalg.solve(C, error[..., None])[..., 0]).sum(axis=1))
+    return np.asarray((error * solved(C, error)).sum(axis=1))
 
 
 def log_densities(error: Array, C: Array) -> Array:
     """Log density of each error (K, n) with its covariance (K, n, n), (K,)."""
-    return np.asarray(-0.5 * (nees_of(error, C) + np.linalg.slogdet(2.0 * np.pi * C)[1]))
+    _, log_determinant = np.linalg.slogdet(2.0 * np.pi * C)
+    return np.asarray(-0.5 * (nees_of(error, C) + log_determinant))
 
 
 def score_of(error: Array, C: Array, F: Array) -> Score:
@@ -38,12 +44,20 @@ def score_of(error: Array, C: Array, F: Array) -> Score:
     G = inverse[:, None] @ F
     flat = G.reshape(*G.shape[:2], -1)
     turned = np.swapaxes(G, -1, -2).reshape(flat.shape)
-    value = -0.5 * float((error * u).sum() + np.linalg.slogdet(C)[1].sum())
-    gradient = 0.5 * (np.einsum("ki,kpij,kj->p", u, F, u, optimize=True) - np.einsum("kpii->p", G))
-    return Score(value, gradient, 0.5 * np.tensordot(flat, turned, ((0, 2), (0, 2))))
+    _, log_determinant = np.linalg.slogdet(C)
+    value = -0.5 * float((error * u).sum() + log_determinant.sum())
+    squares = np.einsum("ki,kpij,kj->p", u, F, u, optimize=True)
+    gradient = 0.5 * (squares - np.einsum("kpii->p", G))
+    information = 0.5 * np.tensordot(flat, turned, ((0, 2), (0, 2)))
+    return Score(value, gradient, information)
 
 
-def maximise(score: Callable[[Array], Score], theta: Array, least: Array | float, close: float) -> Array:
+def maximise(
+    score: Callable[[Array], Score],
+    theta: Array,
+    least: Array | float,
+    close: float,
+) -> Array:
     """Parameters (p,) of at least ``least``, at least 0, with the largest likelihood.
 
     Each step solves the equations of the score with theta >= 0 (Lawson & Hanson 1974), and is halved until the

@@ -81,6 +81,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence
     axis = int(np.argmax(shares))
     there = np.unique(bins)
     scales = noise.mean.values[scale] * (1.0 + values[there])
+    reaches = [np.abs(error[bins == k, axis]).mean() for k in there]
     return MotionDependence(
         scale=TERMS[scale],
         by=by,
@@ -88,7 +89,7 @@ def mean_by_motion(noise: WhiteNoise, windows: DriveWindows) -> MotionDependence
         edges=tuple(float(sizes[bins == k].min()) for k in there[1:]),
         axis=corrected.axes[axis],
         share=float(shares[axis]),
-        reach=max(float(np.abs(error[bins == k, axis]).mean()) for k in there),
+        reach=float(max(reaches)),
         p_value=min(len(questions) * p_value, 1.0),
     )
 
@@ -99,7 +100,12 @@ def bins_of(sizes: Array) -> Indices:
     return np.searchsorted(edges, sizes, side="right")
 
 
-def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) -> float:
+def p_value_of(
+    windows: DriveWindows,
+    pieces: Array,
+    bins: Indices,
+    scale: int,
+) -> float:
     """p-value of a scale that grows from bin to bin, by a score test of errors of windows, beside motions in pieces.
 
     Each drive has constants of its own. The scores of blocks of windows are compared with their scatter (Student's t).
@@ -113,8 +119,10 @@ def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) 
     scores = []
     for drive in drives:
         rows = np.flatnonzero(windows.drive == drive)
-        left = left_by(own[rows].reshape(-1, X.shape[-1]), both[rows].reshape(-1, 2))
-        of_windows = left.prod(axis=1).reshape(len(rows), -1).sum(axis=1)
+        constants = own[rows].reshape(-1, X.shape[-1])
+        left = left_by(constants, both[rows].reshape(-1, 2))
+        products = left.prod(axis=1).reshape(len(rows), -1)
+        of_windows = products.sum(axis=1)
         blocks = min(max(round(BLOCKS / len(drives)), 1), len(rows))
         scores += [block.sum() for block in np.array_split(of_windows, blocks)]
     numbers = windows.errors.size
@@ -122,7 +130,8 @@ def p_value_of(windows: DriveWindows, pieces: Array, bins: Indices, scale: int) 
     error = np.std(scores, ddof=1) * np.sqrt(numbers / free / len(scores))
     if not error > 0:
         return 1.0
-    return float(2.0 * stats.t.sf(abs(np.mean(scores)) / error, len(scores) - 1))
+    t = abs(np.mean(scores)) / error
+    return float(2.0 * stats.t.sf(t, len(scores) - 1))
 
 
 def values_by_bin(windows: DriveWindows, bins: Indices, scale: int) -> tuple[Array, Array]:
@@ -210,4 +219,5 @@ def _own_mean(noise: WhiteNoise, windows: DriveWindows) -> tuple[Array, Array]:
     H = equations.A.sum(axis=0)
     inverted = scaled_inverse(H, 1e-6)
     known = np.diag(H) > 1e-200
-    return inverted @ equations.b.sum(axis=0), np.where(known, np.diag(inverted), np.inf)
+    variances = np.where(known, np.diag(inverted), np.inf)
+    return inverted @ equations.b.sum(axis=0), variances

@@ -109,7 +109,12 @@ def span_of(text: str | float) -> Relative:
     return replace(span, flag="--span")
 
 
-def cut_windows(drives: Sequence[Drive], span: Relative, planar: bool = False, pieces: int = PIECES) -> DriveWindows:
+def cut_windows(
+    drives: Sequence[Drive],
+    span: Relative,
+    planar: bool = False,
+    pieces: int = PIECES,
+) -> DriveWindows:
     """Cut all drives into windows; drives in which none fits have none.
 
     Parameters
@@ -181,18 +186,17 @@ def _jumps(of: DriveWindows) -> Array:
     errors = log(gaps.reshape(W * P, size, size)).reshape(W, P, -1)
     ends = _ends(of.first, of.last, P)
     errors[ends[:, 1:] == ends[:, :-1]] = np.nan  # a piece without a row
-    positions = slice(0, of.d), 0.0
-    rotations = slice(of.d, None), ROUNDED
+    of_windows = of.errors
     found = np.zeros(W, bool)
-    for part, least in (positions, rotations):
-        of_pieces = norms(errors[..., part])
-        of_windows = norms(of.errors[:, part])
+    for part, least in ((slice(of.d), 0.0), (slice(of.d, None), ROUNDED)):  # positions, rotations
+        pieces = norms(errors[..., part])
+        whole = norms(of_windows[:, part])
         for drive in np.unique(of.drive):
             rows = of.drive == drive
-            by_pieces = JUMP_OF_PIECES * float(np.nanmedian(of_pieces[rows]))
-            by_windows = JUMP_OF_WINDOWS * float(np.median(of_windows[rows]))
+            by_pieces = JUMP_OF_PIECES * float(np.nanmedian(pieces[rows]))
+            by_windows = JUMP_OF_WINDOWS * float(np.median(whole[rows]))
             limit = max(by_pieces, by_windows, least)
-            exceeds = np.nan_to_num(of_pieces[rows]) > limit
+            exceeds = np.nan_to_num(pieces[rows]) > limit
             found[rows] |= exceeds.any(axis=1) & (limit > 0)
     return found
 
@@ -200,7 +204,12 @@ def _jumps(of: DriveWindows) -> Array:
 # --- motions as vectors -----------------------------------------------------------------------------------------------
 
 
-def motions_between(T: Array, first: Indices, last: Indices, planar: bool = False) -> Array:
+def motions_between(
+    T: Array,
+    first: Indices,
+    last: Indices,
+    planar: bool = False,
+) -> Array:
     """Motions between rows of poses (N, d + 1, d + 1), in the frame of the first, (..., n)."""
     motions = inverse(T[first]) @ T[last]
     if planar and T.shape[-1] == 4:

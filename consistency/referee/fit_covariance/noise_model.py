@@ -53,7 +53,7 @@ from consistency.referee.fit_covariance.refusals import (
 from consistency.referee.fit_covariance.second_estimator import SecondErrors, errors_of_second
 from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry.lie_groups import log, matrices
-from consistency.referee.readers.pipeline.relative_motions import Stretch
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at
@@ -104,7 +104,7 @@ class NoiseModel:
         return decided(self.spans[0].status, doubted, self.by_motion is not None and self.by_motion.is_found)
 
     @property
-    def stretches(self) -> list[Stretch]:
+    def stretches(self) -> list[Poses]:
         """Judged motions as files have them."""
         return stretches_of(self.windows, self.folds)
 

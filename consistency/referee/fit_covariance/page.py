@@ -46,9 +46,15 @@ MANY = 2000  # errors of motions that are drawn
 EACH = replace(style(0), size=2.0, alpha=0.7)
 
 
-def page_of(said: Document, title: str, caption: str, draw: Callable[[], Drawing]) -> Document:
+def page_of(
+    said: Document,
+    title: str,
+    caption: str,
+    draw: Callable[[], Drawing],
+) -> Document:
     """A document with its picture."""
-    return replace(said, chapters=(Chapter("", "", "", (Figure(title, caption, (draw,)),)),))
+    picture = Figure(title, caption, (draw,))
+    return replace(said, chapters=(Chapter("", "", "", (picture,)),))
 
 
 # --- noise models -----------------------------------------------------------------------------------------------------
@@ -93,7 +99,12 @@ def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
     axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 
 
-def _draw_growth(panel: Axes, model: NoiseModel, axes: Sequence[int], unit: str) -> None:
+def _draw_growth(
+    panel: Axes,
+    model: NoiseModel,
+    axes: Sequence[int],
+    unit: str,
+) -> None:
     found = [error_windows(model, judged) for judged in model.spans]
     spans = np.array([windows.span.size for windows in found])
     squares = np.array([mean_square(windows.errors) for windows in found])
@@ -114,7 +125,8 @@ def _draw_drives(axes: Axes, model: NoiseModel) -> None:
     known = np.flatnonzero(np.isfinite(ratios))
     draw_ratios(axes, [model.drives[i].name for i in known], ratios[known])
     axes.axvline(model.ratio.value, **stroke(LIMIT))
-    axes.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, 1.1 * float(ratios[known].max()))))
+    most = 1.1 * float(ratios[known].max())
+    axes.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, most)))
 
 
 def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
@@ -142,7 +154,8 @@ def correction_page(found: Correction) -> Document:
 
 def draw_correction(found: Correction) -> Drawing:
     """Ratios of held-out runs, factors, and coverage."""
-    rows = np.linspace(0, len(found.judged) - 1, min(MOST_ROWS, len(found.judged))).round().astype(int)
+    judged = len(found.judged)
+    rows = np.linspace(0, judged - 1, min(MOST_ROWS, judged)).round().astype(int)
     figure, (runs, factors, coverage) = canvas(max(2.4, ROW * len(rows)), 3, 3)
     ratios = found.before.ratios, found.after.ratios
     draw_ratios(runs, np.array(found.judged)[rows], *(each[rows] for each in ratios))

@@ -75,7 +75,13 @@ def require_poses(drives: Sequence[Drive]) -> None:
         _require_poses(drive.name, "truth", drive.truth, drive.estimate, "compound them to poses")
 
 
-def _require_poses(drive: str, name: str, T: Array, other: Array, remedy: str) -> None:
+def _require_poses(
+    drive: str,
+    name: str,
+    T: Array,
+    other: Array,
+    remedy: str,
+) -> None:
     if _are_placeholders(T, other):
         raise InputError(
             f"{drive}: all rows of the {name} have one orientation, though the path turns: it is a placeholder, as "
@@ -218,7 +224,8 @@ def rotation_growth(windows: DriveWindows, mean: Mean) -> RotationGrowth:
         return RotationGrowth(float("nan"), float("nan"))
     spans = np.log(LONGER[: len(squares)])
     sizes = np.log(np.maximum(squares, 1e-300))
-    (power, _), covariance = np.polyfit(spans, sizes, 1, w=np.sqrt(0.5 * np.array(counts)), cov="unscaled")
+    weights = np.sqrt(0.5 * np.array(counts))
+    (power, _), covariance = np.polyfit(spans, sizes, 1, w=weights, cov="unscaled")
     return RotationGrowth(float(power), float(np.sqrt(2.0 * covariance[0, 0])))
 
 

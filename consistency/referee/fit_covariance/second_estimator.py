@@ -9,7 +9,12 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import DriveWindows, matrices_of, motions_between
+from consistency.referee.fit_covariance.motion_windows import (
+    DriveWindows,
+    matrices_of,
+    motions_between,
+    root_mean_square,
+)
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.types import Array, Indices
@@ -61,9 +66,11 @@ def errors_of_second(noise: WhiteNoise, windows: DriveWindows, second: Sequence[
     a, b = np.concatenate(first), np.concatenate(other)
     if len(a) < FEWEST:
         raise InputError(f"--second: has {len(a)} windows in common; its times must be those of the estimates")
-    size, size_of_second = (np.maximum(each.std(axis=0), 1e-300) for each in (a, b))
-    covariance = ((a - a.mean(axis=0)) * (b - b.mean(axis=0))).mean(axis=0)
-    return SecondErrors(covariance / (size * size_of_second), size_of_second / size)
+    a -= a.mean(axis=0)
+    b -= b.mean(axis=0)
+    size, size_of_second = root_mean_square(a), root_mean_square(b)
+    correlation = (a * b).mean(axis=0) / (size * size_of_second)
+    return SecondErrors(correlation, size_of_second / size)
 
 
 def _same_drive(drive: Drive, second: Sequence[Drive], drives: int) -> Drive:

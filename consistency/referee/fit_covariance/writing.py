@@ -62,8 +62,7 @@ def seconds(model: NoiseModel) -> float:
     windows = model.windows
     took = []
     for i, first, last in zip(windows.drive, windows.first, windows.last, strict=True):
-        t = windows.drives[i].t
-        took.append(t[last] - t[first])
+        took.append(np.ptp(windows.drives[i].t[[first, last]]))
     median = float(np.median(took))
     return median if np.isfinite(median) and median > 0 else 1.0
 

@@ -29,8 +29,12 @@ def asked(study: Judged) -> tuple[Question, ...]:
     """All questions in the referee's order, with the answers that the verdicts hold."""
     by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
     known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]
-    names = [q for q in dict.fromkeys(known) if any(q in answers for answers in by_filter)]
-    return tuple(Question(q, ABOUT.get(q, ""), tuple(answers.get(q) for answers in by_filter)) for q in names)
+    questions = []
+    for name in dict.fromkeys(known):
+        given = tuple(answers.get(name) for answers in by_filter)
+        if any(answer is not None for answer in given):
+            questions.append(Question(name, ABOUT.get(name, ""), given))
+    return tuple(questions)
 
 
 def diagnosis(study: Judged) -> tuple[Block, ...]:
@@ -52,7 +56,11 @@ def answer_cell(answer: Answer | None) -> tuple[str, str]:
     """Mark, one of MARKS, and corrected p value of one filter's answer to one question."""
     if answer is None:
         return NOT_ASKED, ""
-    mark = TOLERATED if answer.tolerated else FOUND if answer.found else NOT_FOUND
+    mark = NOT_FOUND
+    if answer.tolerated:
+        mark = TOLERATED
+    elif answer.found:
+        mark = FOUND
     return mark, p_cell(answer.adjusted)
 
 

@@ -125,9 +125,12 @@ def forests(study: Judged) -> tuple[Forest, ...]:
 
 
 def _rows(study: Judged, intervals_of: Callable[[Verdict], dict[str, Interval]]) -> tuple[Row, ...]:
-    by_filter = [{k: i for k, i in intervals_of(t.verdict).items() if np.isfinite(i[0])} for t in study.tracks]
-    names = dict.fromkeys(name for intervals in by_filter for name in intervals)
-    return tuple((name, tuple(intervals.get(name) for intervals in by_filter)) for name in names)
+    rows: dict[str, list[Interval | None]] = {}
+    for number, track in enumerate(study.tracks):
+        for name, interval in intervals_of(track.verdict).items():
+            if np.isfinite(interval[0]):
+                rows.setdefault(name, [None] * len(study.tracks))[number] = interval
+    return tuple((name, tuple(row)) for name, row in rows.items())
 
 
 def _ratios(v: Verdict) -> dict[str, Interval]:

@@ -39,8 +39,10 @@ def equivalence_interval(study: Judged) -> str:
         return ""
     verdict = study.tracks[0].verdict
     shown = verdict.equivalence
-    factor = verdict.settings.factor if shown is None else shown.factor
-    low = "(0" if (verdict.settings if shown is None else shown).one_sided else f"[{short(1.0 / factor)}"
+    factor, one_sided = verdict.settings.factor, verdict.settings.one_sided
+    if shown is not None:
+        factor, one_sided = shown.factor, shown.one_sided
+    low = "(0" if one_sided else f"[{short(1.0 / factor)}"
     return f"{low},\u00a0{short(factor)}]"
 
 

@@ -88,7 +88,7 @@ def write_file_reports(
         write_file(at / "verdict.json", data.encode("utf-8"))
 
     write_folder(folder, manifest, contents, overwrite)
-    return [path for path in (folder / name for name in REPORT_FILES) if path.exists()]
+    return [folder / name for name in REPORT_FILES if (folder / name).exists()]
 
 
 def write_text_file(document: Document, path: Path) -> Path:

@@ -11,7 +11,7 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, finite_rows
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for
@@ -22,7 +22,8 @@ CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
 SHIFTS = np.geomspace(0.004, REACH, 12)
 GRID = np.concatenate([-SHIFTS[::-1], [0.0], SHIFTS])  # s, offsets of which the best is refined
-ROUNDS, SETTLED = 5, 1e-4  # of clocks and frames in turn, and the change of the offset, s, that ends them
+ROUNDS = 5  # of clocks and frames in turn
+SETTLED = 1e-4  # s, change of the offset that ends them
 RATE = 1e-4  # probability that an offset is named where there is none
 SHOWN = 5e-4  # probability that a right filter's estimates show an offset of the sign that is looked for
 LEAST = 0.01  # share of the NEES that it makes, at least
@@ -81,20 +82,29 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     The offset minimises the NEES (capped) within a second; one Gauss-Newton step in each run, or in each of
     ``PARTS`` parts of a single one, tells how far runs agree on it (Student's t).
     """
-    some = [sound for poses in runs if len((sound := poses.some(max(MOST // len(runs), 50)).sound()).t)]
+    some = []
+    judged = []
+    for poses in runs:
+        poses = poses.some(max(MOST // len(runs), 50)).sound()
+        if len(poses.t):
+            some.append(poses)
+            whitened = whiten(poses.errors(), poses.covariance)
+            judged.append(np.isfinite(np.square(whitened).sum(axis=1)))
     if not some:
         return None
 
-    judged = [np.isfinite(np.square(whiten(poses.errors(), poses.covariance)).sum(axis=1)) for poses in some]
-
     def size(shift: float) -> float:
-        return float(np.mean([_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]))
+        sizes = [_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]
+        return float(np.mean(sizes))
 
     sizes = np.array([size(shift) for shift in GRID])
-    if not np.isfinite(sizes).any() or np.nanmax(sizes) - np.nanmin(sizes) <= 1e-9 or not size(0.0) > 0.0:
-        return None  # nothing moves, or no error is there to explain
+    at_rest = size(0.0)
+    moves = np.isfinite(sizes).any() and np.nanmax(sizes) - np.nanmin(sizes) > 1e-9
+    if not moves or not at_rest > 0.0:  # or no error is there to explain
+        return None
     value = refined(size, sizes, 1e-5)
-    each = np.concatenate([steps_of(poses, value, 1 if len(some) > 1 else PARTS) for poses in some])
+    parts = 1 if len(some) > 1 else PARTS
+    each = np.concatenate([steps_of(poses, value, parts) for poses in some])
     each = value + each[np.isfinite(each)]
     if len(each) < 3:
         return None
@@ -102,9 +112,12 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     reach = float(distributions.t.ppf(0.975, len(each) - 1) * spread)
     p = float(value == 0.0)
     if spread > 0:
-        p = 2.0 * float(distributions.t.sf(abs(each.mean()) / spread, len(each) - 1))
-    alone = len(some) == 1 and not (size(0.0) > GROSS and size(value) < 0.5 * size(0.0))
-    return Offset(value, value - reach, value + reach, p, 1.0 - size(value) / size(0.0), alone)
+        ratio = abs(each.mean()) / spread
+        p = 2.0 * float(distributions.t.sf(ratio, len(each) - 1))
+    left = size(value)
+    is_gross = at_rest > GROSS and left < 0.5 * at_rest
+    alone = len(some) == 1 and not is_gross
+    return Offset(value, value - reach, value + reach, p, 1.0 - left / at_rest, alone)
 
 
 def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> float:
@@ -131,7 +144,8 @@ def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:
         top, bottom = sums.sum(axis=0)
         without_one = (sums[:, 0] - top) / (bottom - sums[:, 1])
         error = np.sqrt((len(sums) - 1) * without_one.var())
-        return bool(np.sign(-value) * top / bottom > distributions.t.ppf(1.0 - SHOWN, len(sums) - 1) * error)
+        least = distributions.t.ppf(1.0 - SHOWN, len(sums) - 1) * error
+        return bool(np.sign(-value) * top / bottom > least)
 
 
 def _size(poses: Poses, shift: float, judged: Array) -> float:
@@ -140,7 +154,8 @@ def _size(poses: Poses, shift: float, judged: Array) -> float:
         return np.nan
     w = whiten(poses.errors(shift), poses.covariance)
     nees = np.square(w).sum(axis=1) / w.shape[1]
-    return float(np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)[judged].mean())
+    capped = np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)
+    return float(capped[judged].mean())
 
 
 def steps_of(poses: Poses, shift: float, parts: int) -> Array:
@@ -154,19 +169,25 @@ def _estimate_sums(poses: Poses, parts: int) -> Array:
     """Sums as in :func:`_sums_of_parts`, along the motion of the estimates between the two rows before."""
     e, v = _errors_and_motion(poses, 0.0)
     before = np.full_like(e, np.nan)
-    before[2:] = poses.error_of(np.arange(len(e) - 2), poses.estimate[1:-1])
-    return _sums_of_parts(whiten(before, poses.covariance), e, v, parts)
+    rows = np.arange(len(e) - 2)
+    before[2:] = poses.error_of(rows, poses.estimate[1:-1])
+    along = whiten(before, poses.covariance)
+    return _sums_of_parts(along, e, v, parts)
 
 
 def _errors_and_motion(poses: Poses, shift: float) -> tuple[Array, Array]:
     """Errors at ``shift`` and their derivative by it, both whitened, (N, n)."""
-    moved = (poses.errors(shift + STEP) - poses.errors(shift - STEP)) / (2.0 * STEP)
+    later = poses.errors(shift + STEP)
+    earlier = poses.errors(shift - STEP)
+    moved = (later - earlier) / (2.0 * STEP)
     return whiten(poses.errors(shift), poses.covariance), whiten(moved, poses.covariance)
 
 
 def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
     """Sums of the products of ``along`` with errors ``e`` and with their motion ``v``, each (N, n), (parts, 2)."""
-    products = np.column_stack([(along * e).sum(axis=1), (along * v).sum(axis=1)])
-    fine = np.isfinite(products).all(axis=1) & (np.square(e).mean(axis=1) < CAP)
+    of_errors = (along * e).sum(axis=1)
+    of_motion = (along * v).sum(axis=1)
+    products = np.column_stack([of_errors, of_motion])
+    fine = finite_rows(products) & (np.square(e).mean(axis=1) < CAP)
     groups = np.array_split(np.flatnonzero(fine), parts)
     return np.array([products[rows].sum(axis=0) for rows in groups])

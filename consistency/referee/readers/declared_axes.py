@@ -21,7 +21,8 @@ from consistency.referee.types import Array
 X, Y, Z = np.eye(3)
 WORLD = {"e": X, "w": -X, "n": Y, "s": -Y, "u": Z, "d": -Z}  # of axes, in east, north, up
 BODY = {"f": X, "b": -X, "l": Y, "r": -Y, "u": Z, "d": -Z}  # in forward, left, up
-ENU, FLU = "enu", "flu"
+ENU = "enu"
+FLU = "flu"
 
 
 class Axes(NamedTuple):
@@ -49,7 +50,8 @@ def in_axes_of_estimates(e: Estimator, r: Reading) -> Estimator:
     given = r.given(OF_AXES)
     if not given:
         return e
-    if e.innovations_alone or not (e.in_space or tuple(e.axes) == ("x", "y", "heading")):
+    are_poses = e.in_space or tuple(e.axes) == ("x", "y", "heading")
+    if e.innovations_alone or not are_poses:
         raise InputError(f"{flag_of(given[0])}: needs poses or positions with a truth; {e.path} has none")
     own, true = axes_of_files(r, e.in_space)
     world = _matrix("--world", own.world, WORLD).T @ _matrix("--truth-world", true.world, WORLD)
@@ -102,17 +104,20 @@ def _matrix(option: str, letters: str, directions: Mapping[str, Array]) -> Array
 def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
     """A run with its truth in other axes, and the covariance of that truth."""
     A, C = change
-    truth, P = p.truth.copy(), p.true_covariance
+    truth = p.truth.copy()
+    P = p.true_covariance
     if not in_space:
         truth[:, :2] = truth[:, :2] @ A[:2, :2].T
         start = A @ C.T
-        truth[:, 2] = A[2, 2] * truth[:, 2] + np.arctan2(start[1, 0], start[0, 0])
+        turned = np.arctan2(start[1, 0], start[0, 0])
+        truth[:, 2] = A[2, 2] * truth[:, 2] + turned
         if p.manifold == "planar":
             truth[:, 2] = wrap(truth[:, 2])
     else:
         truth[:, :3] = truth[:, :3] @ A.T
         if p.manifold == "spatial" and len(truth):
-            R = Rotation.from_matrix(A) * Rotation.from_quat(truth[:, 3:7]) * Rotation.from_matrix(C.T)
+            R = Rotation.from_quat(truth[:, 3:7])
+            R = Rotation.from_matrix(A) * R * Rotation.from_matrix(C.T)
             truth[:, 3:7] = R.as_quat()
         for first, axes in ((7, A), (10, C), (13, C)):  # velocity, biases of gyroscope and accelerometer
             if first < truth.shape[1]:
@@ -125,11 +130,16 @@ def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
 def _carried(P: Array, convention: str, change: Change, in_space: bool) -> Array:
     """Covariances (M, n, n) of errors of the truth in other axes; of positions or planar poses n is 3, of poses 6."""
     A, C = change
-    blocks = {"so3-body": (A, C), "left": (C, C)}.get(convention, (A, A))
+    position = rotation = A
+    if convention == "left":
+        position = C
+    if convention in ("left", "so3-body"):
+        rotation = C
     if convention == "additive":
         raise InputError("--truth-covariance: goes with no other axes of the truth where the error is 'additive'")
     T = np.zeros((6, 6))
-    T[:3, :3], T[3:, 3:] = blocks
+    T[:3, :3] = position
+    T[3:, 3:] = rotation
     if P.shape[-1] == 3:
         part = [0, 1, 2] if in_space else [0, 1, 5]
         T = T[np.ix_(part, part)]

@@ -8,12 +8,16 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, finite_rows
 from consistency.referee.types import Array
 
-JUMP, SMOOTH, OFTEN = 180.0, 60.0, 3  # degrees between rows, and what is left less a whole turn; no rad jump as often
-TURNING, ALONG = 0.15, 0.2  # rad, spread of a course; the part of it that headings in degrees do not explain, at most
-STANDING, FEWEST = 1e-6, 10  # m between two rows; steps along a path
+JUMP = 180.0  # degrees between two rows
+SMOOTH = 60.0  # degrees that are left of a jump less a whole turn
+OFTEN = 3  # jumps: headings in rad do not jump as often
+TURNING = 0.15  # rad, spread of a course
+ALONG = 0.2  # the part of it that headings in degrees do not explain, at most
+STANDING = 1e-6  # m between two rows
+FEWEST = 10  # steps along a path
 FITTING = (0.05, 4.0)  # median of squared errors over variances, of which chi-square has 0.45
 
 
@@ -29,11 +33,13 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
     if not runs or runs[0].manifold != "planar":
         return
     for side, name in (("truth", "truth"), ("estimates", "estimate")):
-        poses, beyond = [], False
+        poses = []
+        beyond = False
         for p in runs:
             values = getattr(p, name)
-            poses.append(values[np.isfinite(values).all(axis=1)])
-            beyond |= bool((np.abs(poses[-1][:, 2]) > 2.0 * np.pi + 0.1).any())
+            finite = values[finite_rows(values)]
+            poses.append(finite)
+            beyond |= bool((np.abs(finite[:, 2]) > 2.0 * np.pi + 0.1).any())
         if beyond and jumps([each[:, 2] for each in poses]):
             why = "jump by a whole turn of 360"
         elif turn_in_degrees(poses):
@@ -48,7 +54,8 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
 
 def jumps(headings: Sequence[Array]) -> bool:
     """Whether headings (N,) within one turn of 360 jump by it: where all else is smooth, or often."""
-    found, least = 0, 1
+    found = 0
+    least = 1
     for heading in headings:
         if len(heading) and np.ptp(heading) > 360.0:
             return False
@@ -61,7 +68,9 @@ def jumps(headings: Sequence[Array]) -> bool:
 
 def turn_in_degrees(poses: Sequence[Array]) -> bool:
     """Whether headings of poses (N, 3), read as degrees, explain how the direction of the path turns."""
-    turning, unexplained, steps = 0.0, 0.0, 0
+    turning = 0.0
+    unexplained = 0.0
+    steps = 0
     for each in poses:
         if len(each) < 2:
             continue
@@ -71,7 +80,8 @@ def turn_in_degrees(poses: Sequence[Array]) -> bool:
         if not moving.any():
             continue
         course = np.unwrap(np.arctan2(way[moving, 1], way[moving, 0]))
-        apart = np.unwrap(wrap(np.deg2rad(each[:-1, 2][moving]) - course))
+        heading = np.deg2rad(each[:-1, 2][moving])
+        apart = np.unwrap(wrap(heading - course))
         turning += course.var() * len(course)
         unexplained += apart.var() * len(course)
         steps += len(course)
@@ -80,12 +90,17 @@ def turn_in_degrees(poses: Sequence[Array]) -> bool:
 
 def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     """Whether errors of headings, read as degrees, are of the size of variances, most of them beyond pi^2."""
-    gaps, variances = [], []
+    gaps = []
+    variances = []
     for p in runs:
-        known = p.known()
-        gaps.append(known.truth[:, 2] - p.estimate[known.rows, 2])
-        variances.append(p.covariance[known.rows, 2, 2])
-    gap, variance = np.concatenate(gaps), np.concatenate(variances)
+        known = p.matched()
+        gaps.append(known.truth[:, 2] - known.estimate[:, 2])
+        variances.append(known.covariance[:, 2, 2])
+    gap = np.concatenate(gaps)
+    variance = np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)
-    ratio = np.square(gap[some] - 360.0 * np.round(gap[some] / 360.0)) / variance[some]
-    return 2 * len(ratio) > len(gap) and bool(FITTING[0] < np.median(ratio) < FITTING[1])
+    error = gap[some] - 360.0 * np.round(gap[some] / 360.0)
+    ratio = np.square(error) / variance[some]
+    if 2 * len(ratio) <= len(gap):
+        return False
+    return bool(FITTING[0] < np.median(ratio) < FITTING[1])

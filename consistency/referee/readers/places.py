@@ -16,7 +16,8 @@ class Places:
     """Places of some rows of a file, put into words when asked for."""
 
     def __init__(self, of: Callable[[int], str], rows: Indices) -> None:
-        self._of, self._rows = of, rows
+        self._of = of
+        self._rows = rows
 
     def __getitem__(self, which: int) -> str:
         return self._of(int(self._rows[which]))

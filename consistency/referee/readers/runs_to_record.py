@@ -16,9 +16,13 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
-from consistency.referee.readers.truth_matching import at, submatrices
+from consistency.referee.readers.truth_matching import Estimator, at, finite_rows, submatrices
 from consistency.referee.types import Array, Failure, Indices
 
+STILL = (
+    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
+    "robot in the plane"
+)
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
 ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
 
@@ -83,7 +87,10 @@ def assemble(
     """
     tracks = sorted(tracks, key=lambda track: track.run)
     _require_different(file, tracks)
-    failures, parts, short, skipped = [], [], [], 0
+    failures = []
+    parts = []
+    short = []
+    skipped = 0
     longest = longest_start(tracks)
     for track in tracks:
         start, end, reason = judged_rows(track, longest)
@@ -106,9 +113,16 @@ def assemble(
         )
     dof = len(axes) if arrays["error"] is not None else 0
     return Record(
-        name, runs=np.array([track.run for track in tracks], dtype=np.int64), t=t, dof=dof, axes=axes,
-        failures=tuple(failures), convention=convention, notes=tuple(notes), **arrays,
-    )  # fmt: skip
+        name,
+        runs=np.array([track.run for track in tracks], dtype=np.int64),
+        t=t,
+        dof=dof,
+        axes=axes,
+        failures=tuple(failures),
+        convention=convention,
+        notes=tuple(notes),
+        **arrays,
+    )
 
 
 def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
@@ -121,7 +135,8 @@ def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
             if values is None:
                 continue
             if arrays[key] is None:
-                arrays[key] = np.full((len(tracks), steps, *values.shape[1:]), np.nan)
+                shape = (len(tracks), steps, *values.shape[1:])
+                arrays[key] = np.full(shape, np.nan)
             arrays[key][row, track.column] = values
     arrays["times"] = arrays.pop("t")
     return arrays
@@ -150,7 +165,9 @@ def _require_different(file: str, tracks: Sequence[Track]) -> None:
     for track in tracks:
         if track.error is None or len(track.error) < 2 or not np.nan_to_num(track.error).any():
             continue
-        other = seen.setdefault(hashlib.sha256(np.ascontiguousarray(track.error).tobytes()).digest(), track)
+        error = np.ascontiguousarray(track.error)
+        digest = hashlib.sha256(error.tobytes()).digest()
+        other = seen.setdefault(digest, track)
         if other is not track:
             raise InputError(
                 f"{file}: the runs that start at {other.place[0]} and {track.place[0]} are identical; "
@@ -168,7 +185,9 @@ def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool
     if one_triangle:
         upper = np.triu(covariance, 1).any(axis=(1, 2))
         lower = np.tril(covariance, -1).any(axis=(1, 2))
-        one_triangle = bool((upper.all() and not lower.any()) or (lower.all() and not upper.any()))
+        is_upper = upper.all() and not lower.any()
+        is_lower = lower.all() and not upper.any()
+        one_triangle = bool(is_upper or is_lower)
     with np.errstate(invalid="ignore"):  # of infinite ones
         for piece in of_runs(out):
             P = covariance[piece]
@@ -213,9 +232,10 @@ def _first(full: Array) -> int:
 def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
     """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
-    error_ok, kind = np.ones(rows, bool), np.zeros(rows, int)
+    error_ok = np.ones(rows, bool)
+    kind = np.zeros(rows, int)
     if track.error is not None:
-        error_ok = np.asarray(np.isfinite(track.error).all(axis=1))
+        error_ok = finite_rows(track.error)
     if track.covariance is not None:
         kind = classify(track.covariance, ROUNDED)
     full: Array = np.asarray(kind == Validity.VALID)
@@ -236,15 +256,19 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
 
 def _cut(track: Track, start: int, end: int) -> Track:
     """Rows before ``end``, with their NEES from ``start`` on."""
-    arrays: dict[str, Any] = {key: at(getattr(track, key), slice(end)) for key in ("column", "t", *ARRAYS)}
+    arrays: dict[str, Any] = {}
+    for key in ("column", "t", *ARRAYS):
+        arrays[key] = at(getattr(track, key), slice(end))
     track = replace(track, place=track.place.at(slice(end)), **arrays)
-    error, P = track.error, track.covariance
+    error = track.error
+    P = track.covariance
     if error is None or P is None:
         return track
     values = np.full(end, np.nan)
     values[start:] = nees(error[start:], P[start:])
     if start:
-        P = np.concatenate([np.full_like(P[:start], np.nan), P[start:]])
+        unknown = np.full_like(P[:start], np.nan)
+        P = np.concatenate([unknown, P[start:]])
     return replace(track, covariance=P, nees=values)
 
 
@@ -260,16 +284,34 @@ def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indice
     variance = np.concatenate(variances)
     variance = variance[~np.isnan(variance).any(axis=1)]
     still = ~(np.abs(np.concatenate(errors)) > NO_ERROR).any(axis=0)
-    idle: Indices = still & (variance == variance[:1]).all(axis=0) & (len(variance) > 1)
+    constant = (variance == variance[:1]).all(axis=0)
+    idle: Indices = still & constant & (len(variance) > 1)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
     return np.zeros(len(idle), bool) if still.all() or none.any() else idle
+
+
+def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
+    """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
+    part = np.array(judged)
+    variances = []
+    of_part = []
+    for p, error in zip(e.runs, errors, strict=True):
+        variances.append(p.variances[p.stated][:, part])
+        of_part.append(error[:, part])
+    idle = not_estimated(of_part, variances)
+    if not idle.any():
+        return list(judged), []
+    names = ", ".join(np.array(e.axes)[part[idle]])
+    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
+    return part[~idle].tolist(), [note]
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     """Message that no covariance has full rank, and what to judge in place of all components."""
     P = np.concatenate([track.covariance for track in tracks if track.covariance is not None])
     errors = np.concatenate([track.error for track in tracks if track.error is not None])
-    none = (np.abs(np.diagonal(P, axis1=-2, axis2=-1)) <= ROUNDED.zero).all(axis=0)
+    variances = np.abs(np.diagonal(P, axis1=-2, axis2=-1))
+    none = (variances <= ROUNDED.zero).all(axis=0)
     still = ~(np.abs(errors) > NO_ERROR).any(axis=0)
     if none.all():
         return f"{file}: the covariance is zero in every step; nothing to judge"
@@ -278,7 +320,8 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if not none.any():
         return f"{singular}; write only the states that the filter estimates by themselves"
     singular += f" (variance zero: {', '.join(names[none])})"
-    missing, idle = none & ~still, ~none & still
+    missing = none & ~still
+    idle = ~none & still
     if missing.any() and idle.any():
         return (
             f"{singular}; {', '.join(names[missing])} has errors without a variance, and {', '.join(names[idle])} a "

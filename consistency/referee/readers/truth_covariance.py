@@ -70,7 +70,8 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
         record = replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared))
         missing = 0
         if record.nees is not None:
-            missing = int((np.isnan(P).any(axis=(2, 3)) & np.isfinite(record.nees)).sum())
+            unknown = np.isnan(P).any(axis=(2, 3))
+            missing = int((unknown & np.isfinite(record.nees)).sum())
         if missing and not np.isfinite(P).any():
             raise InputError(f"{record.name}: the truth has a covariance in none of the steps that are judged")
         if missing:

@@ -22,6 +22,7 @@ REST = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # velocity,
 STATE = (*AXES, *REST)
 Manifold = Literal["vector", "planar", "spatial"]  # plain; x, y, heading; x, y, z, a quaternion x, y, z, w and more
 BRIDGED = 0.1  # s between two samples of the truth that are always interpolated: a period of 10 Hz
+Files = tuple[Path | str, Path | str]  # of the estimates, of the truth
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
 
 
@@ -51,7 +52,8 @@ def common_times(times: Sequence[Array]) -> tuple[list[Indices], Array]:
     for own in times:
         near = np.clip(np.searchsorted(longest, own - ROUNDING), 0, len(longest) - 1)
         if (np.abs(longest[near] - own) > ROUNDING).any():
-            return [np.arange(len(each)) for each in times], np.full(len(longest), np.nan)
+            counted = [np.arange(len(each)) for each in times]
+            return counted, np.full(len(longest), np.nan)
         columns.append(near.astype(np.int64))
     return columns, longest
 
@@ -94,21 +96,30 @@ def truth_at(times: Array, reference: Array, values: Array, manifold: Manifold, 
     after = np.minimum(before + 1, last)
     gap = reference[after] - reference[before]
     inside = (times >= reference[before]) & (times <= reference[after]) & (gap > 0)
-    apart = np.minimum(np.abs(times - reference[before]), np.abs(reference[after] - times))
+    to_before = np.abs(times - reference[before])
+    to_after = np.abs(times - reference[after])
+    apart = np.minimum(to_before, to_after)
     rows = np.flatnonzero((apart <= max_dt + ROUNDING) | (inside & (gap <= BRIDGED + ROUNDING)))
-    before, after, gap = before[rows], after[rows], gap[rows]
-    inside, apart = inside[rows], apart[rows]
-    share = np.where(inside, (times[rows] - reference[before]) / np.where(gap > 0, gap, 1.0), 0.0)
-    later = ~inside & (np.abs(times[rows] - reference[after]) < np.abs(times[rows] - reference[before]))
-    truth = _between(values[np.where(later, after, before)], values[after], share, manifold)
-    bend = _bends(values[:, : 2 if manifold == "planar" else 3], before) * 4.0 * share * (1.0 - share)
+    before = before[rows]
+    after = after[rows]
+    gap = gap[rows]
+    inside = inside[rows]
+    apart = apart[rows]
+    since = times[rows] - reference[before]
+    share = np.where(inside, since / np.where(gap > 0, gap, 1.0), 0.0)
+    later = ~inside & (to_after[rows] < to_before[rows])
+    start = values[np.where(later, after, before)]
+    truth = _between(start, values[after], share, manifold)
+    width = 2 if manifold == "planar" else 3
+    bend = _bends(values[:, :width], before) * 4.0 * share * (1.0 - share)
     return Known(rows, truth, before, apart, bend)
 
 
 def nearest(times: Array, reference: Array, before: Indices) -> Indices:
     """The nearest sample to each of ``times`` (k,), from the one at or before it."""
     after = np.minimum(before + 1, len(reference) - 1)
-    return np.where(np.abs(times - reference[after]) < np.abs(times - reference[before]), after, before)
+    is_later = np.abs(times - reference[after]) < np.abs(times - reference[before])
+    return np.where(is_later, after, before)
 
 
 def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Array:
@@ -123,8 +134,10 @@ def _between(start: Array, end: Array, share: Array, manifold: Manifold) -> Arra
     if manifold == "spatial" and len(turned):
         from scipy.spatial.transform import Rotation  # half of what a planar log would load
 
-        first, second = (Rotation.from_quat(values[turned, 3:7]) for values in (start, end))
-        turn = Rotation.from_rotvec(share[turned, None] * (first.inv() * second).as_rotvec())
+        first = Rotation.from_quat(start[turned, 3:7])
+        second = Rotation.from_quat(end[turned, 3:7])
+        way = (first.inv() * second).as_rotvec()
+        turn = Rotation.from_rotvec(share[turned, None] * way)
         out[turned, 3:7] = (first * turn).as_quat()
     out[share == 0.0] = start[share == 0.0]
     return np.asarray(out)
@@ -136,8 +149,13 @@ def _bends(position: Array, after: Indices) -> Array:
     if last < 1:
         return np.zeros(len(after))
     second = np.linalg.norm(np.diff(position, 2, axis=0), axis=1)  # of samples 1, 2, ...
-    before, behind = (second[np.clip(after + side, 1, last) - 1] for side in (0, 1))
+    before = second[np.clip(after, 1, last) - 1]
+    behind = second[np.clip(after + 1, 1, last) - 1]
     return np.asarray(np.maximum(before, behind) / 8.0)
+
+
+OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend")
+OF_TRUTH = ("true_t", "truth", "true_clock", "true_covariance")
 
 
 @dataclass(frozen=True)
@@ -161,7 +179,7 @@ class Poses:
     true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
     run: int = 0
     name: str = ""  # of a drive
-    files: tuple[Path | str, Path | str] = ("the estimates", "the truth")
+    files: Files = ("the estimates", "the truth")
     numbered: bool = False  # t are numbers of steps
     clock: Array | None = None  # (N,), s, where t are numbers of steps
     true_clock: Array | None = None  # (M,), s
@@ -175,8 +193,9 @@ class Poses:
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
         if self.true_t is self.t and not shift:  # beside the estimates
-            none = np.zeros(len(self.t))
-            return Known(np.arange(len(self.t)), self.truth, np.arange(len(self.t)), none, none)
+            rows = np.arange(len(self.t))
+            none = np.zeros(len(rows))
+            return Known(rows, self.truth, rows, none, none)
         return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
 
     def matched(self, shift: float = 0.0) -> Poses:
@@ -187,9 +206,14 @@ class Poses:
         if P is not None:
             P = P[nearest(found.t + shift, self.true_t, known.before)]
         return replace(
-            found, true_t=found.t, truth=known.truth, true_covariance=P, true_clock=at(self.true_clock, known.before),
-            apart=known.apart, bend=known.bend,
-        )  # fmt: skip
+            found,
+            true_t=found.t,
+            truth=known.truth,
+            true_covariance=P,
+            true_clock=at(self.true_clock, known.before),
+            apart=known.apart,
+            bend=known.bend,
+        )
 
     def pairs(self, kept: Array) -> Poses:
         """Some of the estimates, by truth values or indices, with the truth beside each of them."""
@@ -197,7 +221,7 @@ class Poses:
         if len(rows) == len(self.t):
             return self
         found = self.of_rows(rows).beside(rows)
-        return replace(found, true_t=found.t, apart=at(self.apart, rows), bend=at(self.bend, rows))
+        return replace(found, true_t=found.t)
 
     def errors(self, shift: float = 0.0) -> Array:
         """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
@@ -211,13 +235,23 @@ class Poses:
     def error_of(self, rows: Indices, truth: Array) -> Array:
         """Error (k, n) of some rows; NaN where the estimate is not finite."""
         estimate = self.estimate[rows]
-        finite = np.isfinite(estimate).all(axis=1)
+        finite = finite_rows(estimate)
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
         error = planar_error
         if self.manifold == "spatial":
             from consistency.referee.geometry.lie_groups import state_error as error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
+
+    @property
+    def d(self) -> int:
+        """2 in the plane, 3 in space."""
+        return 2 if self.covariance.shape[-1] == 3 else 3
+
+    @property
+    def variances(self) -> Array:
+        """Diagonals of the covariances, (N, n)."""
+        return np.diagonal(self.covariance, axis1=1, axis2=2)
 
     @property
     def seconds(self) -> Array:
@@ -235,39 +269,39 @@ class Poses:
 
     def sound(self) -> Poses:
         """Estimates that are finite, with a finite covariance."""
-        finite = np.isfinite(self.estimate).all(axis=1) & np.isfinite(self.covariance).all((1, 2))
+        finite = finite_rows(self.estimate) & finite_rows(self.covariance)
         return self.of_rows(np.flatnonzero(finite))
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""
         if len(self.t) <= most:
             return self
-        return self.of_rows(np.unique(np.linspace(0, len(self.t) - 1, most).astype(int)))
+        places = np.linspace(0, len(self.t) - 1, most)
+        return self.of_rows(np.unique(places.astype(int)))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
         if self.manifold != "spatial" or self.covariance.shape[-1] == 6:
             return self
         return replace(
-            self, estimate=self.estimate[:, :7], covariance=self.covariance[:, :6, :6], truth=self.truth[:, :7]
+            self,
+            estimate=self.estimate[:, :7],
+            covariance=self.covariance[:, :6, :6],
+            truth=self.truth[:, :7],
         )
 
     def of_rows(self, rows: Indices) -> Poses:
         """Some of the estimates beside all of the truth."""
         if len(rows) == len(self.t):
             return self
-        return replace(
-            self, place=self.place.at(rows), t=self.t[rows], estimate=self.estimate[rows],
-            covariance=self.covariance[rows], stated=self.stated[rows], cross=at(self.cross, rows),
-            clock=at(self.clock, rows), nis=at(self.nis, rows), nis_dof=at(self.nis_dof, rows), by=at(self.by, rows),
-        )  # fmt: skip
+        return replace(self, place=self.place.at(rows), **self._rows_of(OF_ESTIMATES, rows))
 
     def beside(self, samples: Indices) -> Poses:
         """The estimates beside some samples of the truth."""
-        return replace(
-            self, true_t=self.true_t[samples], truth=self.truth[samples], true_clock=at(self.true_clock, samples),
-            true_covariance=at(self.true_covariance, samples),
-        )  # fmt: skip
+        return replace(self, **self._rows_of(OF_TRUTH, samples))
+
+    def _rows_of(self, names: Sequence[str], rows: Indices) -> dict[str, Any]:
+        return {name: at(getattr(self, name), rows) for name in names}
 
 
 Change = Callable[[Poses], Poses]  # what is read otherwise
@@ -278,6 +312,11 @@ def at(values: Array | None, rows: Any) -> Array | None:
     if values is None:
         return None
     return np.asarray(values[rows])
+
+
+def finite_rows(values: Array) -> Array:
+    """Which rows of values (N, ...) hold finite numbers alone, (N,) of bool."""
+    return np.asarray(np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
 
 
 def submatrices(P: Array, index: Sequence[int]) -> Array:
@@ -303,9 +342,8 @@ WHOLE = Stated()
 ALONE = Stated(alone=True)
 POINTS = Stated({"": slice(3)})  # positions without orientations
 BLOCKS = Stated({" position": slice(3), " rotation": slice(3, 6)})
-SINGLE = Stated(
-    {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)} | {" velocity and biases": slice(6, None)}, alone=True
-)
+_EACH = {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)}
+SINGLE = Stated({**_EACH, " velocity and biases": slice(6, None)}, alone=True)
 
 
 @dataclass(frozen=True)

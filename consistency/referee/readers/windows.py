@@ -67,7 +67,8 @@ def relative_of(size: str | float | None, motions: bool = False, windows: str | 
             raise InputError("--windows goes with --relative, which cuts a log into windows")
         return None
     match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([sm]?)\s*", str(size))
-    value, unit = math.nan, "step"
+    value = math.nan
+    unit = "step"
     if match:
         unit = UNITS[match[2]]
         with suppress(ValueError):
@@ -96,7 +97,8 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
         No window fits, or seconds are asked for and rows have no time.
     """
     place = _along(t, position, rows, relative, file)
-    first, last = [], []
+    first = []
+    last = []
     skipped = i = 0
     while (j := int(np.searchsorted(place, place[i] + relative.size - ROUNDING))) < len(place):
         if place[j] - place[i] > (1.0 + OVERSHOOT) * relative.size:
@@ -117,11 +119,13 @@ def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: s
         if not np.isfinite(t[rows]).all():
             raise InputError(f"{file}: {relative.flag} {relative.option} needs a column t, in s")
         return t[rows]
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    return np.append(0.0, np.cumsum(steps))
 
 
 def _none(place: Array, relative: Relative, file: str) -> str:
-    length, unit = float(place[-1] - place[0]), {"step": " steps"}.get(relative.unit, f" {relative.unit}")
+    length = float(place[-1] - place[0])
+    unit = {"step": " steps"}.get(relative.unit, f" {relative.unit}")
     if length < relative.size - ROUNDING:
         return f"{file}: {relative.flag} {relative.option}: only {length:.4g}{unit} have truth; ask for shorter windows"
     gap = float(np.median(np.diff(place)))

@@ -20,4 +20,4 @@ FORMATS = {f".{name[3:]}": f"{__name__}.{name}" for _, name, _ in iter_modules(_
 def rendered(document: Document, path: Path) -> str:
     """The text of a file, in the format of its suffix."""
     text: str = import_module(FORMATS[path.suffix.lower()]).render(document)
-    return text + "\n" * (not text.endswith("\n"))
+    return text if text.endswith("\n") else f"{text}\n"

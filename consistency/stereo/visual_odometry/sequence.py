@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibrati
 from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
 
+BothSides: TypeAlias = tuple[list[Path], list[Path]]  # images of the left and of the right camera
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")
 KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"))
 RAW_PAIRS = (("image_00", "image_01"), ("image_02", "image_03"))
@@ -198,7 +200,7 @@ def _images(folder: Path, pattern: str = "*") -> list[Path]:
     return sorted(found)
 
 
-def _require_pairs(folder: Path, files: tuple[list[Path], list[Path]], t: Array | None) -> None:
+def _require_pairs(folder: Path, files: BothSides, t: Array | None) -> None:
     pairs = min(map(len, files))
     if pairs < FEWEST:
         raise InputError(f"{folder}: holds {pairs} stereo pairs; a motion takes at least {FEWEST}")
@@ -237,7 +239,7 @@ def _require_no_gap(files: list[Path]) -> None:
         )
 
 
-def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Path], list[Path]]:
+def _by_name(folder: Path, left: list[Path], right: list[Path]) -> BothSides:
     """Both lists, if every image has a partner of the same name."""
     names = {path.stem for path in left} & {path.stem for path in right}
     for path in left + right:
@@ -246,7 +248,7 @@ def _by_name(folder: Path, left: list[Path], right: list[Path]) -> tuple[list[Pa
     return left, right
 
 
-def _kitti(folder: Path) -> tuple[list[Path], list[Path]]:
+def _kitti(folder: Path) -> BothSides:
     one, two = _required_pair(folder, KITTI_PAIRS)
     return _by_name(folder, _images(folder / one), _images(folder / two))
 
@@ -261,7 +263,7 @@ def _kitti_times(folder: Path) -> Array | None:
     return t[:, 0]
 
 
-def _kitti_raw(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
+def _kitti_raw(folder: Path) -> tuple[BothSides, Array]:
     """Images of the first pair of cameras that is there, and the times of the left one in seconds from the first."""
     one, two = _required_pair(folder, RAW_PAIRS)
     files = _by_name(folder, _images(folder / one / "data"), _images(folder / two / "data"))
@@ -282,7 +284,7 @@ def read_number_table(path: Path, delimiter: str | None, refusal: str) -> Array:
     return values
 
 
-def _euroc(folder: Path) -> tuple[tuple[list[Path], list[Path]], Array]:
+def _euroc(folder: Path) -> tuple[BothSides, Array]:
     """Images of both cameras and times in seconds; the names, or data.csv, are nanoseconds."""
     root = folder
     if (folder / "mav0").is_dir():
@@ -328,7 +330,7 @@ def _listed_images(table: Path, images: Path) -> list[tuple[int, Path]]:
     return pairs
 
 
-def _plain(folder: Path, left: str | None, right: str | None) -> tuple[list[Path], list[Path]]:
+def _plain(folder: Path, left: str | None, right: str | None) -> BothSides:
     """Images by pattern, paired in sorted order; names may differ between the cameras."""
     given = left is not None and right is not None
     if left is None or right is None:

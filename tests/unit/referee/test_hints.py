@@ -30,7 +30,7 @@ from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess
 from consistency.referee.readers.mix_ups.known_worlds import _ned
 from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned
-from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions
+from consistency.referee.readers.pipeline.relative_motions import causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
@@ -239,7 +239,7 @@ def test_a_body_that_is_turned_over_takes_its_covariance_along(convention, rng):
     ).as_quat()
     S = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, -1.0]) if convention == "so3-body" else np.diag([1.0, -1.0, -1.0] * 2)
     there = replace(there, covariance=S @ there.covariance @ S)
-    *_, undo = _ned(convention)
+    *_, undo = _ned()
     assert_allclose(decades([undo.change(there)]), decades([p]), atol=1e-9)
 
 
@@ -567,10 +567,9 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng):
 
     def causes(some):
         P_, C = (M[:, some][:, :, some] for M in (P, before))
-        track = Stretch(
-            0, "est", Places("line {}".format, np.arange(400)), np.arange(400.0), pose, P_, C, np.arange(400),
-            pose + e, "so2",
-        )  # fmt: skip
+        t = np.arange(400.0)
+        place = Places("line {}".format, np.arange(400))
+        track = Poses(place, t, pose, P_, np.ones(400, bool), t, pose + e, "planar", "so2", 0.0, cross=C)
         return causes_of_motions("est", [track], THREE, range(3), Relative(1.0, "step"))
 
     assert causes([0, 1, 2]) == []

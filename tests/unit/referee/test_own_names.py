@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.readers.formats.column_renaming import renamed
+from consistency.referee.readers.formats.spellings import renamed
 from consistency.referee.readers.places import one_of_each_kind
 
 STEPS = 6

@@ -549,7 +549,7 @@ def test_where_when_and_how_much(fresh):
     low, high = verdict.inflation_interval
     assert low < (1 + 1 + 6) / 3 * 1.6
     assert high > (1 + 1 + 6) / 3 / 1.6
-    assert "mainly heading" in verdict.reasons[0]
+    assert "; heading too small by x" in verdict.reasons[0]
     assert "no bias found" in verdict.reasons[0]
 
 

@@ -126,7 +126,7 @@ def test_a_window_over_missing_rows_is_left_out():
 def test_rows_without_truth_change_no_other_window(rng):
     stretch, size = motion_stretch(drive(rng, "SE(2)", 12)), Relative(2, "step", True, True)
     there = np.delete(np.arange(13), 3)
-    whole, some = windows_of(stretch, size), windows_of(replace(stretch, rows=there, truth=stretch.truth[there]), size)
+    whole, some = windows_of(stretch, size), windows_of(stretch.beside(there), size)
     same, here = np.nonzero((whole.t[:, None] == some.t) & (whole.track.t[:, None] == some.track.t))
     assert len(here) >= 4
     assert_array_equal(some.error[here], whole.error[same])
@@ -272,12 +272,12 @@ def test_poses_need_a_cross_covariance_of_the_very_next_row(rng):
 def test_runs_have_windows_by_their_times_where_those_are_known(rng):
     """The second run has no truth before its fifth row, and so no first two windows."""
     first, second = (motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2))
-    late = replace(second, rows=second.rows[4:], truth=second.truth[4:])
+    late = second.beside(np.arange(4, 13))
     record = recorded([first, late], "2", True)
     assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
     assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
     assert np.isnan(record.error[1, :2]).all()
-    timeless = [replace(each, t=np.full(13, np.nan)) for each in (first, late)]
+    timeless = [replace(each, numbered=True) for each in (first, late)]
     record = recorded(timeless, "2", True)
     assert np.isnan(record.t).all()
     assert np.isnan(record.error[1, 4:]).all()
@@ -308,7 +308,7 @@ def test_notes_say_what_windows_are_of(rng):
 def test_windows_that_are_left_out_are_counted(rng):
     stretches = [motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2)]
     there = np.delete(np.arange(13), 3)
-    some = [replace(stretch, rows=there, truth=stretch.truth[there]) for stretch in stretches]
+    some = [stretch.beside(there) for stretch in stretches]
     size = "0.1s"
     found = [windows_of(stretch, Relative(0.1, "s", True, True)) for stretch in some]
     assert [each.left_out for each in found] == [1, 1]

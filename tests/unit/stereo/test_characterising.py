@@ -3,6 +3,8 @@
 Random tests have levels of 1e-7 an interval, so that one of them fails by chance in less than one of a million runs.
 """
 
+from dataclasses import replace
+
 import characterisation as benchmark
 import numpy as np
 import pytest
@@ -12,12 +14,14 @@ import consistency as cs
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.effects.node_tables import BiasMap, bilinear, hats
 from consistency.bench.simulation import simulate
+from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
 from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.coordinate_fit import Levels, moving_over_rest, rate, tails
+from consistency.stereo.characterising.coordinate_fit import Levels, Mixture, moving_over_rest, rate, tails
 from consistency.stereo.characterising.likelihood import Likelihood, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.sensor_text import sentences
 from consistency.stereo.characterising.truth_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
@@ -208,6 +212,15 @@ def test_few_wide_errors_are_told_from_students_tails(rng):
     both = (1 - found.mixture.share) * found.mixture.core**2 + found.mixture.share * found.mixture.wide**2
     assert np.isclose(both, 1.0, rtol=0.01)
     assert tails(stats.t.rvs(4, size=8000, random_state=rng), LEVEL).mixture is None
+
+
+def test_a_mixture_is_told_by_its_parts(rng):
+    of = characterise(data_of(rng, 2000, 1.0), SENSOR, "test")
+    sigma = of.coordinates[0].sigma.value
+    mixed = of.coordinates[0].tails._replace(weight=Interval(0.2, 0.1, 0.3), mixture=Mixture(0.05, 0.9, 3.0))
+    of = replace(of, coordinates=(replace(of.coordinates[0], tails=mixed), *of.coordinates[1:]))
+    told = f"not Gaussian: as if 95 % had sd {0.9 * sigma:.3g} px and 5 % {3.0 * sigma:.3g} px"
+    assert told in sentences(of)[0]
 
 
 def test_a_rate_has_the_interval_of_clopper_and_pearson():

@@ -99,6 +99,15 @@ def test_bands_of_rows_change_nothing(rng):
     assert_array_equal(stereo_matches(RECTIFIED, left, right).pairs, whole)
 
 
+def test_a_rival_on_the_other_side_of_a_band_is_seen(rng):
+    """Row 31.5 has the better match of the right feature; row 32.5, of the next band, must not take it."""
+    one = unit(rng, 1)
+    worse = one + 0.03 * unit(rng, 1)
+    left = features(np.array([[600.0, 31.5], [600.0, 32.5]]), np.concatenate([one, worse / np.linalg.norm(worse)]))
+    right = features(np.array([[590.0, 32.2]]), one)
+    assert_array_equal(stereo_matches(RECTIFIED, left, right).pairs, [[0, 0]])
+
+
 def test_a_circle_must_close(rng):
     descriptors = unit(rng, 20)
     uv = np.zeros((20, 2))

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import scene
 from numpy.testing import assert_allclose, assert_array_equal
@@ -18,6 +19,7 @@ from consistency.referee.geometry.lie_groups import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.camera_truth import read_truth
+from consistency.stereo.frontend.images_to_log import motions_text
 from consistency.stereo.frontend.planar_log import (
     CAMERA,
     in_robot_axes,
@@ -29,7 +31,7 @@ from consistency.stereo.frontend.planar_log import (
 from consistency.stereo.visual_odometry.odometry import trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import ESTIMATORS, MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import read_sequence
-from consistency.stereo.visual_odometry.tracks import linked
+from consistency.stereo.visual_odometry.tracks import TrackSelection, linked, thinned
 from consistency.vision import ConsensusError, RelativePose, relative_motion
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
@@ -141,6 +143,23 @@ def test_a_dark_frame_is_bridged(wall, tmp_path):
 def test_matches_of_consecutive_pairs_become_tracks():
     links = [np.array([[0, 5], [1, 6]]), np.array([[6, 2], [7, 3]]), np.array([[2, 0], [9, 1]])]
     assert [t.tolist() for t in linked(links)] == [[0, 1], [1, 2], [1, 3]]
+
+
+def test_long_tracks_are_cut_at_two_ages_and_short_ones_left_out():
+    long, short = np.arange(30), np.arange(5, 7)
+    piece = np.repeat([0, 1], [len(long), len(short)])
+    rows = pd.DataFrame({"piece": piece, "step": np.concatenate([long, short]), "z0": 0.0, "z1": 0.0, "z2": 9.0})
+    found = thinned(rows, TrackSelection(slots=2, max_age=12, min_life=3, bands=3, width=100.0))
+    assert np.bincount(found["landmark"]).tolist() == [6, 12, 11]
+    assert found["step"].tolist() == list(range(1, 30))
+
+
+def test_motions_begin_with_the_identity():
+    lines = motions_text(np.array([0.0, 0.5]), np.eye(3)[None], np.array([[1.0, 2.0, 3.0]]), np.eye(6)[None]).split(
+        "\n"
+    )
+    assert lines[0].split() == ["0.000000000", "0", "0", "0", "0", "0", "0", "1", *["0"] * 36]
+    assert lines[1].split()[:8] == ["0.500000000", "1", "2", "3", "0", "0", "0", "1"]
 
 
 def motion(pose, S):

@@ -106,6 +106,10 @@ def test_features_are_spread_over_the_image():
     assert in_corner[0] > 0.9 > 0.6 > in_corner[1]
     cells = {(int(u // 64), int(v // 60)) for u, v in spread + np.array([160, 120])}
     assert len(cells) >= 18
+    strongest = {}
+    for u, v in GoodFeatures(0, quality=0.001).choose(image):
+        strongest.setdefault((u + 160) // 64 + 5 * ((v + 120) // 60), (u, v))
+    assert set(strongest.values()) <= set(map(tuple, spread))
 
 
 def test_left_right_check_finds_what_only_one_image_sees():

@@ -17,8 +17,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from consistency.bench.filters.compiled import problem_of
 from consistency.bench.filters.external.gtsam_factors import PlanarStereo, landmark_key, pose_key
+from consistency.bench.filters.filter_declarations import problem_of
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import Belief

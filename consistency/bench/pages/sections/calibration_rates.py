@@ -106,7 +106,8 @@ def shipped() -> Path | None:
 
 def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
     rows = list(rows)
-    found, gates = (np.array([row[key] for row in rows], float) for key in ("found", "gates"))
+    found = np.array([row["found"] for row in rows], float)
+    gates = np.array([row["gates"] for row in rows], float)
     intervals = zip(*binomial_interval(found, gates, CONFIDENCE), strict=True)
     for row, (low, high) in zip(rows, intervals, strict=True):
         yield Rate(
@@ -127,10 +128,11 @@ def calibration_rates() -> tuple[Block, ...]:
 
 def groups(c: Calibration) -> tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]:
     """What is counted, and for each promise about it, in all its worlds, cells as COLUMNS."""
-    return tuple(
-        (f"{name}: {about.replace('`', '')}", tuple(_row(p) for p in c.promises if p.question == name))
-        for name, about in c.questions.items()
-    )
+    promises = []
+    for name, about in c.questions.items():
+        rows = tuple(_row(promise) for promise in c.promises if promise.question == name)
+        promises.append((f"{name}: {about.replace('`', '')}", rows))
+    return tuple(promises)
 
 
 def _row(promise: Promise) -> tuple[Cell, ...]:

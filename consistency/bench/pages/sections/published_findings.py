@@ -133,10 +133,9 @@ def listing(data: pd.DataFrame, heads: Mapping[str, tuple[str, str]], label: str
     heads : column: head, and the format of a number, :data:`P_VALUE`, :data:`STATUS`, or "" for text
     """
     columns = tuple(Column(head, number=form not in ("", STATUS)) for head, form in heads.values())
-    rows = [
-        tuple(_cell(value, form) for value, (_, form) in zip(row, heads.values(), strict=True))
-        for row in data[list(heads)].itertuples(index=False)
-    ]
+    forms, rows = [form for _, form in heads.values()], []
+    for row in data[list(heads)].itertuples(index=False):
+        rows.append(tuple(map(_cell, row, forms)))
     return table(columns, rows, label, caption=caption)
 
 

@@ -142,8 +142,8 @@ class Isolation:
         with _lock:
             if not self._is_open:
                 raise RuntimeError("the study has ended")
-            worker = self._free.pop() if self._free else _idle.pop() if _idle else None
-            worker = _Worker() if worker is None else worker
+            waiting = self._free or _idle
+            worker = waiting.pop() if waiting else _Worker()
             self._busy.add(worker)
         try:
             yield worker

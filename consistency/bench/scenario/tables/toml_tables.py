@@ -59,8 +59,11 @@ class Table(BaseModel):
             stem, _, unit = key.rpartition("_")
             of_sigma = SIGMA_UNITS.get(str(data.get("model")), f"_{unit}")
             wanted = cls.units.get(stem) or (of_sigma if stem == "sigma" else UNITS.get(stem))
-            has_unit = key not in cls.model_fields and stem in cls.model_fields and f"_{unit}" == wanted
-            bare, factor = (stem, np.pi / 180.0 if unit == "deg" else 1.0) if has_unit else (key, 1.0)
+            bare, factor = key, 1.0
+            if key not in cls.model_fields and stem in cls.model_fields and f"_{unit}" == wanted:
+                bare = stem
+                if unit == "deg":
+                    factor = np.pi / 180.0
             if bare in out:
                 raise ValueError(f"key '{bare}' is given twice, with and without its unit")
             out[bare] = _scaled(value, factor)

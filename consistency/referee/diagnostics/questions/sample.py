@@ -239,7 +239,8 @@ def runs_and_steps(record: Record) -> tuple[int, int]:
         raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     for name, shape in shapes.items():
         if len(shape) != dimensions[name]:
-            raise ValueError(f"{name} must be (runs, steps{', n' * (dimensions[name] - 2)}), got shape {shape}")
+            expected = ", ".join(["runs", "steps", "n", "n"][: dimensions[name]])
+            raise ValueError(f"{name} must be ({expected}), got shape {shape}")
     if len({shape[:2] for shape in shapes.values()}) > 1:
         raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")
     if "error" in shapes and "covariance" in shapes and shapes["covariance"][2:] != shapes["error"][2:] * 2:

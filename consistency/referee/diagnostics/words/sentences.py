@@ -418,7 +418,7 @@ def _without_truth(v: Findings, i: Innovations) -> str:
         parts.append(f"no fault found in the innovations, {is_shown.format(ratio)} {_between(shown)}")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
-    return "; ".join([*parts, "without truth most pose errors cannot be seen"])
+    return "; ".join([*parts, "no truth: most pose errors cannot be seen"])
 
 
 def _nis(i: Innovations) -> str:

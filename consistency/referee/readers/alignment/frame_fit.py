@@ -18,11 +18,12 @@ from consistency.referee.readers.alignment.world_frames import (
     moved,
     turned_frame,
 )
-from consistency.referee.readers.truth_matching import Known, Poses, submatrices
+from consistency.referee.readers.truth_matching import Known, Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 
 STEP = 1e-6  # m or rad, over which the change of an error is taken
-ROUNDS, DONE = 20, 1e-3  # steps of a fit at most; the last one, in stated standard deviations: the next is its square
+ROUNDS = 20  # steps of a fit at most
+DONE = 1e-3  # size of the last one, in stated standard deviations: the next is its square
 RANK = 1e-10  # of the largest singular value: directions that no error shows
 
 
@@ -40,13 +41,17 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
     if known is None:
         known = p.known()
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
-    fine = np.isfinite(w).all(axis=1) & p.stated[known.rows]
+    fine = finite_rows(w) & p.stated[known.rows]
     return Sound(known.rows[fine], known.truth[fine], w[fine])
 
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
     index = list(judged)
-    return by_runs(lambda e, at: whiten(e[:, index], submatrices(p.covariance[at], index)), error, rows)
+
+    def of_block(e: Array, at: Indices) -> Array:
+        return whiten(e[:, index], submatrices(p.covariance[at], index))
+
+    return by_runs(of_block, error, rows)
 
 
 def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
@@ -65,7 +70,8 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
         for k, motion in enumerate(STEP * free):
             after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
             before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
-            out[:, :, k] = _whitened(p, rows, (after - before) / (2.0 * STEP), judged)
+            change = (after - before) / (2.0 * STEP)
+            out[:, :, k] = _whitened(p, rows, change, judged)
         return out
 
     return by_runs(of_block, sound.truth, sound.rows)
@@ -86,7 +92,8 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     known = [p.known() for p in runs]
 
     def at(frame: WorldTransform) -> tuple[float, list[tuple[Poses, Sound]]]:
-        found, nees = [], 0.0
+        found = []
+        nees = 0.0
         for p, k in zip(runs, known, strict=True):
             there = moved(p, frame)
             sound = sound_of(there, judged, k)
@@ -102,7 +109,8 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
         step, size = _step(found, free, judged)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
-            step, size = 0.5 * step, 0.5 * size
+            step = 0.5 * step
+            size = 0.5 * size
             further = _small(step @ free).after(frame)
         frame = further
         if size <= DONE:
@@ -113,8 +121,13 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
 
 def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
     """Gauss-Newton step (d,), and its length in stated standard deviations."""
-    A = np.concatenate([tangent(p, sound, free, judged).reshape(-1, len(free)) for p, sound in found])
-    w = np.concatenate([sound.whitened.ravel() for _, sound in found])
+    tangents = []
+    whitened = []
+    for p, sound in found:
+        tangents.append(tangent(p, sound, free, judged).reshape(-1, len(free)))
+        whitened.append(sound.whitened.ravel())
+    A = np.concatenate(tangents)
+    w = np.concatenate(whitened)
     scale = _sizes(A)
     step = -np.linalg.lstsq(A / scale, w, rcond=RANK)[0] / scale
     return step, float(np.linalg.norm(A @ step))
@@ -130,7 +143,8 @@ def orthonormal(tangents: Sequence[Array]) -> list[Array]:
     A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
     U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
     U = U[:, s > RANK * s[0]]
-    bases, start = [], 0
+    bases = []
+    start = 0
     for each in tangents:
         end = start + each.shape[0] * each.shape[1]
         bases.append(U[start:end].reshape(*each.shape[:2], -1))

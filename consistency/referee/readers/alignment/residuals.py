@@ -14,7 +14,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, positions, rotations
 from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
-from consistency.referee.readers.truth_matching import Poses, submatrices
+from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
 FREE = {  # directions (d, 6) in which a frame may move: shift along x, y, z, turn about them
@@ -94,17 +94,18 @@ def clocks_and_frames(
     if isinstance(time_offset, float):
         shift = time_offset
     for _ in range(ROUNDS):
-        before, later = shift, [p.later(shift) for p in runs]
+        before = shift
+        later = [p.later(shift) for p in runs]
         frames = frames_of(name, later, align, judged)
         shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
         if abs(shift - before) <= SETTLED:
             break
-    if shift == before:
-        found = aligned(name, later, align, judged, frames)
-    else:
-        found = aligned(name, [p.later(shift) for p in runs], align, judged)
-    back = zip(found.runs, runs, strict=True)
-    return shift, notes, replace(found, runs=[replace(p, t=own.t) for p, own in back])
+    later = [p.later(shift) for p in runs]
+    found = aligned(name, later, align, judged, frames if shift == before else None)
+    as_before = []
+    for p, own in zip(found.runs, runs, strict=True):
+        as_before.append(replace(p, t=own.t))
+    return shift, notes, replace(found, runs=as_before)
 
 
 def _moved(runs: Sequence[Poses], frames: Sequence[WorldTransform]) -> list[Poses]:
@@ -135,7 +136,8 @@ def aligned(
         frames = frames_of(name, runs, mode, judged)
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    return replace(found, align=mode, notes=(_sizes(name, mode, frames), *found.notes))
+    sizes = _sizes(name, mode, frames)
+    return replace(found, align=mode, notes=(sizes, *found.notes))
 
 
 # --- residual errors -------------------------------------------------------------------------------------------
@@ -145,7 +147,9 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     """Covariances of the residuals of a fit; unchanged where these are not known."""
     for_all = mode.endswith("-all")
     free = _directions(mode, runs)
-    residuals, tangents, some = [], [], []
+    residuals = []
+    tangents = []
+    some = []
     for i, p in enumerate(runs):
         sound = sound_of(p, judged)
         if len(sound.rows):
@@ -154,7 +158,8 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
             tangents.append(tangent(p, sound, free, judged))
     of = "each run"
     if for_all:
-        bases, of = orthonormal(tangents), "all runs"
+        bases = orthonormal(tangents)
+        of = "all runs"
     else:
         bases = [orthonormal([A])[0] for A in tangents]
     dof = max(Q.shape[-1] for Q in bases)
@@ -169,10 +174,13 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         note = f"the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
         caption = f"{of_runs.caption}, and {OSCILLATING} ({most})"
         return replace(of_runs, notes=(f"{name}: {note}",), caption=caption, unseen=left.unseen)
-    kept, largest = np.empty(len(some)), 0.0
+    kept = np.empty(len(some))
+    largest = 0.0
     for k, M in enumerate(left.covariances):
-        kept[k] = max(float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged), LEAST)
-        largest = max(largest, float(np.linalg.eigvalsh(M)[:, -1].max()))
+        share = float(np.trace(M, axis1=1, axis2=2).mean()) / len(judged)
+        kept[k] = max(share, LEAST)
+        of_run = float(np.linalg.eigvalsh(M)[:, -1].max())
+        largest = max(largest, of_run)
     out = list(runs)
     for i, share in zip(some, kept, strict=True):
         out[i] = replace(runs[i], covariance=runs[i].covariance * share)
@@ -189,12 +197,14 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
-    out, factors = [], []
+    out = []
+    factors = []
     for p in runs:
         first, larger_by = from_first_pose(name, p, judged)
         out.append(first)
         factors.append(larger_by)
-    every, larger = np.concatenate(factors), 1.0
+    every = np.concatenate(factors)
+    larger = 1.0
     if len(every):
         larger = float(np.median(every))
     if larger < 1.0 + SLIGHT:
@@ -235,16 +245,19 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
         No estimate is finite and has a truth and a covariance.
     """
     row, truth = _first(name, p)
-    own, true = p.estimate[[row]], truth[None]
-    turn = (rotations(true, p.manifold) * rotations(own, p.manifold).inv())[0]
-    return WorldTransform(turn, (positions(true, p.manifold) - turn.apply(positions(own, p.manifold)))[0])
+    own = p.estimate[[row]]
+    true = truth[None]
+    turns = rotations(true, p.manifold) * rotations(own, p.manifold).inv()
+    turn = turns[0]
+    shift = positions(true, p.manifold) - turn.apply(positions(own, p.manifold))
+    return WorldTransform(turn, shift[0])
 
 
 def _first(name: str, p: Poses) -> tuple[int, Array]:
     """Row of the first estimate that is finite and has a truth and a covariance, and its truth (m,)."""
     known = p.known()
-    fine = p.stated[known.rows] & np.isfinite(p.estimate[known.rows]).all(axis=1)
-    fine &= np.isfinite(p.covariance[known.rows]).all(axis=(1, 2))
+    fine = p.stated[known.rows] & finite_rows(p.estimate[known.rows])
+    fine &= finite_rows(p.covariance[known.rows])
     if not fine.any():
         raise InputError(f"--align origin: a run of {name} has no estimate with a truth and a covariance to begin at")
     k = int(np.argmax(fine))
@@ -267,12 +280,15 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     sound = sound_of(p, judged)
     seen = submatrices(_seen(name, p, row, sound), judged)
     own = submatrices(p.covariance[sound.rows], judged)
-    size = np.trace(np.linalg.solve(own, seen), axis1=1, axis2=2) / len(judged)
+    ratio = np.linalg.solve(own, seen)
+    size = np.trace(ratio, axis1=1, axis2=2) / len(judged)
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
     bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
-    P, index = p.covariance.copy(), np.array(judged)
-    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + np.swapaxes(bound, 1, 2))
+    P = p.covariance.copy()
+    index = np.array(judged)
+    mirrored = np.swapaxes(bound, 1, 2)
+    P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + mirrored)
     P[row] = 0.0
     return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
 
@@ -283,7 +299,10 @@ def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
     free = np.eye(6)
     if n == 3:
         free = free[[0, 1, 5]]
-    plain = replace(p, covariance=np.tile(np.eye(n), (len(p.t), 1, 1)))
-    first = Sound(np.array([row]), _first(name, p)[1][None], np.zeros((1, n)))
-    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(tangent(plain, first, free, range(n))[0])
+    alike = np.tile(np.eye(n), (len(p.t), 1, 1))
+    plain = replace(p, covariance=alike)
+    _, truth = _first(name, p)
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)))
+    of_first = tangent(plain, first, free, range(n))[0]
+    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(of_first)
     return np.asarray(J @ p.covariance[row] @ np.swapaxes(J, 1, 2))

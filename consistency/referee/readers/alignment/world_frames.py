@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.truth_matching import Manifold, Poses, submatrices
+from consistency.referee.geometry.lie_groups import adjoint, inverse, matrices, propagated, to_left, vectors
+from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows
 from consistency.referee.types import Array
 
 
@@ -26,7 +27,8 @@ class WorldTransform:
     @staticmethod
     def about_z(angle: float, shift: Array) -> WorldTransform:
         """Turn by ``angle``, rad, and shift (2,) or (3,), m."""
-        return WorldTransform(Rotation.from_euler("z", angle), np.append(shift, np.zeros(3 - len(shift))))
+        level = np.zeros(3 - len(shift))
+        return WorldTransform(Rotation.from_euler("z", angle), np.append(shift, level))
 
     @property
     def heading(self) -> float:
@@ -40,14 +42,16 @@ class WorldTransform:
     def placed(self, values: Array, manifold: Manifold) -> Array:
         """Poses or positions (k, m) of one world in the other; those that are not finite stay."""
         out: Array = values.copy()
-        finite = np.isfinite(values).all(axis=1)
+        finite = finite_rows(values)
         if manifold == "planar":
-            out[:, :2] = values[:, :2] @ self.turn.as_matrix()[:2, :2].T + self.shift[:2]
+            R = self.turn.as_matrix()[:2, :2]
+            out[:, :2] = values[:, :2] @ R.T + self.shift[:2]
             out[:, 2] = wrap(values[:, 2] + self.heading)
         elif finite.any():
             out[finite, :3] = self.turn.apply(values[finite, :3]) + self.shift
             if manifold == "spatial":
-                out[finite, 3:] = (self.turn * Rotation.from_quat(values[finite, 3:])).as_quat()
+                turned = self.turn * Rotation.from_quat(values[finite, 3:])
+                out[finite, 3:] = turned.as_quat()
         return out
 
 
@@ -58,7 +62,8 @@ IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 def moved(p: Poses, frame: WorldTransform) -> Poses:
     """The estimates in another world, with their covariance."""
     T = carried(p.convention, frame, p.covariance.shape[-1])
-    return replace(p, estimate=frame.placed(p.estimate, p.manifold), covariance=T @ p.covariance @ T.T)
+    estimate = frame.placed(p.estimate, p.manifold)
+    return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
 
 
 def carried(convention: str, frame: WorldTransform, n: int) -> Array:
@@ -66,19 +71,11 @@ def carried(convention: str, frame: WorldTransform, n: int) -> Array:
 
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
-    if convention == "left":
-        return np.eye(n)
-    turn = frame.turn.as_matrix()
-    T = np.eye(6)
-    T[:3, :3] = turn
-    if convention in ("so3", "right"):
-        T[3:, 3:] = turn
-    if convention == "right":
-        T[:3, 3:] = skew(frame.shift) @ turn
+    F = matrices(np.array([[*frame.shift, *frame.turn.as_quat()]]))
+    T: Array = to_left(inverse(F), convention)[0]
     if n == 6:
         return T
-    part = PLANE[:n]
-    return T[np.ix_(part, part)]
+    return T[np.ix_(PLANE[:n], PLANE[:n])]
 
 
 def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
@@ -89,8 +86,11 @@ def fitted_frame(runs: Sequence[Poses]) -> WorldTransform | None:
     own, true = _positions(runs)
     if len(own) < 3:
         return None
-    a, b = own - own.mean(axis=0), true - true.mean(axis=0)
-    angle = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    a = own - own.mean(axis=0)
+    b = true - true.mean(axis=0)
+    across = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
+    along = (a[:, :2] * b[:, :2]).sum()
+    angle = float(np.arctan2(across, along))
     turn = Rotation.from_euler("z", angle)
     return WorldTransform(turn, true.mean(axis=0) - turn.apply(own.mean(axis=0)))
 
@@ -101,7 +101,8 @@ def turned_frame(runs: Sequence[Poses]) -> WorldTransform:
     for p in runs:
         own, true = matched(p)
         if len(own):
-            turns.append((rotations(true, p.manifold) * rotations(own, p.manifold).inv()).mean())
+            apart = rotations(true, p.manifold) * rotations(own, p.manifold).inv()
+            turns.append(apart.mean())
     if not turns:
         return IDENTITY
     turn = Rotation.concatenate(turns).mean()
@@ -114,12 +115,14 @@ def spread(runs: Sequence[Poses]) -> float:
     true = _positions(runs)[1]
     if not len(true):
         return 0.0
-    return float(np.sqrt(np.square(true - true.mean(axis=0)).sum(axis=1).mean()))
+    squares = np.square(true - true.mean(axis=0)).sum(axis=1)
+    return float(np.sqrt(squares.mean()))
 
 
 def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
     """Estimated and true positions (N, 3) of all runs, z = 0 in the plane."""
-    own, true = [np.empty((0, 3))], [np.empty((0, 3))]
+    own = [np.empty((0, 3))]
+    true = [np.empty((0, 3))]
     for p in runs:
         estimate, truth = matched(p)
         own.append(positions(estimate, p.manifold))
@@ -131,7 +134,7 @@ def matched(p: Poses) -> tuple[Array, Array]:
     """Estimates that are finite and have a truth, and that truth, (k, m) both."""
     known = p.known()
     estimate = p.estimate[known.rows]
-    finite = np.isfinite(estimate).all(axis=1)
+    finite = finite_rows(estimate)
     return estimate[finite], known.truth[finite]
 
 
@@ -148,56 +151,39 @@ def fitted_body(runs: Sequence[Poses]) -> BodyTransform | None:
 
     The turn is the mean of R_estimate' R_truth, the arm the mean of R_estimate' (p_truth - p_estimate).
     """
-    turns, arms = [], []
+    turns = []
+    arms = []
     for p in runs:
         own, true = matched(p)
         if len(own):
             back = rotations(own, p.manifold).inv()
             turns.append((back * rotations(true, p.manifold)).mean())
-            arms.append(back.apply(positions(true, p.manifold) - positions(own, p.manifold)))
+            gap = positions(true, p.manifold) - positions(own, p.manifold)
+            arms.append(back.apply(gap))
     if not turns:
         return None
-    return BodyTransform(Rotation.concatenate(turns).mean(), np.concatenate(arms).mean(axis=0))
+    arm = np.concatenate(arms).mean(axis=0)
+    return BodyTransform(Rotation.concatenate(turns).mean(), arm)
 
 
 def on_body(p: Poses, body: BodyTransform) -> Poses:
-    """The estimates as poses of the other body, with their covariance to first order."""
-    finite = np.isfinite(p.estimate).all(axis=1)
-    estimate, covariance = p.estimate.copy(), p.covariance.copy()
-    if not finite.any():
-        return p
-    own = p.estimate[finite]
-    R = rotations(own, p.manifold)
-    shift = R.apply(body.arm)
-    J = _jacobian(p.convention, R.as_matrix(), body)
-    if p.manifold == "planar":
-        heading = wrap(own[:, 2] + body.turn.as_rotvec()[2])
-        estimate[finite] = np.column_stack([own[:, :2] + shift[:, :2], heading])
-        J = submatrices(J, PLANE)
-    else:
-        estimate[finite] = np.column_stack([own[:, :3] + shift, (R * body.turn).as_quat()])
-    covariance[finite] = J @ p.covariance[finite] @ np.swapaxes(J, 1, 2)
-    return replace(p, estimate=estimate, covariance=covariance)
+    """The estimates as poses of the other body, with their covariance to first order.
 
-
-def _jacobian(convention: str, R: Array, body: BodyTransform) -> Array:
-    """Error of the other pose by that of the own, (k, 6, 6), in each convention.
-
-    That of ``right`` is unchanged, and that of ``left`` maps by the adjoint (Sola et al. 2018, eq. 175); the others are
-    derivatives of p + R l at 0.
+    The left error of T B is Ad(B)^-1 e of the left error e of T (Sola et al. 2018, eq. 175).
     """
-    J = np.broadcast_to(np.eye(6), (len(R), 6, 6)).copy()
-    back, arm = body.turn.inv().as_matrix(), np.broadcast_to(body.arm, (len(R), 3))
-    if convention == "left":
-        J[:, :3, :3] = back
-        J[:, :3, 3:] = -back @ skew(arm)
-        J[:, 3:, 3:] = back
-    elif convention == "so3-body":
-        J[:, :3, 3:] = -R @ skew(arm)
-        J[:, 3:, 3:] = back
-    elif convention != "right":
-        J[:, :3, 3:] = -skew((R @ arm[..., None])[..., 0])
-    return np.asarray(J)
+    finite = finite_rows(p.estimate)
+    pose = [*body.arm, *body.turn.as_quat()]
+    if p.manifold == "planar":
+        pose = [*body.arm[:2], body.turn.as_rotvec()[2]]
+    B = matrices(np.array([pose]))
+    T = matrices(p.estimate[finite])
+    other = T @ B
+    J = to_left(inverse(other), p.convention) @ adjoint(inverse(B)) @ to_left(T, p.convention)
+    estimate = p.estimate.copy()
+    covariance = p.covariance.copy()
+    estimate[finite] = vectors(other)
+    covariance[finite] = propagated(J, p.covariance[finite])
+    return replace(p, estimate=estimate, covariance=covariance)
 
 
 def skew(v: Array) -> Array:

@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.records.groups_by_column import on_steps
 from consistency.referee.diagnostics.records.record import numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading, require_name, require_room
-from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof
+from consistency.referee.readers.formats.sheet import NIS_DOF, checked_dof
 from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
@@ -32,8 +32,6 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
     if not is_file(path):
         raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
     if path.suffix.lower() == ".mat":
-        from consistency.referee.readers.formats.matlab_file import load_matlab
-
         return load_matlab(path)
     with path.open("rb") as file:
         what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
@@ -119,7 +117,8 @@ class Archive:
         if "lengths" not in self:
             return [steps] * runs
         lengths = np.atleast_1d(self.arrays["lengths"])
-        if lengths.shape != (runs,) or lengths.dtype.kind not in "iu" or ((lengths < 1) | (lengths > steps)).any():
+        are_whole = lengths.shape == (runs,) and lengths.dtype.kind in "iu"
+        if not are_whole or lengths.min() < 1 or lengths.max() > steps:
             raise InputError(f"{self.path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
         return [int(length) for length in lengths]
 
@@ -140,19 +139,21 @@ class Archive:
         nis = self.array("nis", 2)
         if nis.shape != shape:
             raise InputError(f"{self.path}: key 'nis' has shape {nis.shape}, needs {shape}")
-        dof = self.whole_numbers("nis_dof", shape)
-        known = np.isfinite(nis)
-        if (nis < 0).any() or np.isinf(nis).any() or not are_dof(dof[known]).all():
-            needed = "nis must be 0 or more, nis_dof whole numbers from 0 to below 2^31"
-            raise InputError(f"{self.path}: keys 'nis', 'nis_dof': {needed}")
-        return nis, np.where(known, dof, 0.0)
+        dof = np.where(np.isnan(nis), 0.0, self.whole_numbers("nis_dof", shape))
+        steps = shape[1]
+
+        def place(k: int) -> str:
+            return f"{self.path}, run {k // steps}, step {k % steps + 1}"
+
+        return nis, checked_dof(nis.ravel(), dof.ravel(), place).reshape(shape)
 
     def times(self, steps: int) -> Array:
         """Key ``t``, (steps,) in s; NaN without it."""
         if "t" not in self:
             return np.full(steps, np.nan)
         t = self.arrays["t"]
-        if t.shape != (steps,) or t.dtype.kind not in "fiu" or not (np.diff(t) > 0).all():
+        are_numbers = t.shape == (steps,) and t.dtype.kind in "fiu"
+        if not are_numbers or not (np.diff(t) > 0).all():
             raise InputError(f"{self.path}: key 't' must be {steps} increasing numbers, in s")
         return np.asarray(t, float)
 
@@ -184,3 +185,48 @@ def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
     if found != (needed[1], needed[0], *needed[2:]):
         return ""
     return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"
+
+
+# --- files of MATLAB ---------------------------------------------------------------------------------
+
+
+HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
+
+
+def load_matlab(path: Path) -> dict[str, Array]:
+    """Arrays by name. MATLAB drops a last dimension of 1, which a single component has: it is restored."""
+    from scipy.io import loadmat, whosmat
+
+    with reading(path), path.open("rb") as file:
+        if file.read(len(HDF5)) == HDF5:
+            raise InputError(f"{path}: is of MATLAB 7.3; write it with save(..., '-v7')")
+    with reading(path):
+        sizes = [int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)]
+        require_room(path, 8 * sum(sizes))
+        arrays = {}
+        for key, value in loadmat(path).items():
+            if not key.startswith("__"):
+                arrays[key] = _array(key, value)
+    P = arrays.get("covariances")
+    if P is None or P.ndim > 2:
+        return arrays
+    if P.shape[1] == 1:
+        raise InputError(f"{path}: key 'covariances' has shape {P.shape}: one run of one component has (1, steps)")
+    arrays["covariances"] = P[..., None, None]
+    for key in {"errors", "estimates", "truth"} & set(arrays):
+        arrays[key] = arrays[key][..., None]
+    return arrays
+
+
+def _array(key: str, value: object) -> Array:
+    """An array of a key; MATLAB has no fewer than two dimensions, no truth values, and texts in a cell."""
+    array = np.asarray(value)
+    if key in ("t", "lengths"):
+        return array.ravel()
+    if key == "dof":
+        return array.squeeze()
+    if key == "mask":
+        return np.asarray(array != 0)
+    if key == "axes":
+        return np.array([str(np.squeeze(each)) for each in array.ravel()])
+    return array

@@ -18,8 +18,14 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.formats.innovation_files import NisLog, choose, numbered_log
-from consistency.referee.readers.formats.logged_innovations import MICRO, Pairs, require_in_order
+from consistency.referee.readers.formats.innovation_files import (
+    MICRO,
+    NisLog,
+    Pairs,
+    choose,
+    numbered_log,
+    require_in_order,
+)
 from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
@@ -39,7 +45,7 @@ class Ratio(NamedTuple):
     gates: tuple[str, ...]  # parameters
 
 
-class Stated(NamedTuple):
+class LoggedSensor(NamedTuple):
     """Innovations of a sensor with their variances."""
 
     message: str
@@ -56,8 +62,8 @@ RATIOS = {
     "tas": Ratio("SVT", 1, ("EAS",)),
 }  # by sensor
 STATED = {
-    "odometry": Stated("XKFD", ("IX", "IY", "IZ"), ("IVX", "IVY", "IVZ"), 1),
-    "beacon": Stated("XKF0", ("innov",), ("SIV",), 2),
+    "odometry": LoggedSensor("XKFD", ("IX", "IY", "IZ"), ("IVX", "IVY", "IVZ"), 1),
+    "beacon": LoggedSensor("XKF0", ("innov",), ("SIV",), 2),
 }  # by sensor
 
 

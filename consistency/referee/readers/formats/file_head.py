@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from consistency.referee.parsing import is_file
-from consistency.referee.readers.formats.column_renaming import Columns, renamed
+from consistency.referee.readers.formats.spellings import Columns, renamed
 from consistency.referee.readers.formats.text_blocks import opened
 
 PEEKED = 2**16  # bytes of a file that hold its header and its first row

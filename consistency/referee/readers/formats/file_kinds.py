@@ -6,20 +6,18 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.columns import pose_columns, rates_in, state_columns
 from consistency.referee.readers.formats.file_head import beginning, begins_with_numbers, head_of
-from consistency.referee.readers.formats.named_columns import clock_of, places_of, roles_of
+from consistency.referee.readers.formats.spellings import PLAIN, Columns, clock_of
+from consistency.referee.readers.options import Reading
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
 HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
-SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
-TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
-HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
-PLACES = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)
 
 
 def is_bag(path: Path) -> bool:
@@ -54,8 +52,8 @@ def is_poses(path: Path, columns: Columns | None = None) -> bool:
     head = head_of(path, columns)
     if head is None:
         return begins_with_numbers(path)
-    roles = roles_of(head.names, path)
-    return "heading" not in head.names and roles is not None and bool(roles.quaternion)
+    found = pose_columns(head.names, path)
+    return "heading" not in head.names and found is not None and bool(found.quaternion)
 
 
 def is_plane(path: Path, columns: Columns | None = None) -> bool:
@@ -63,7 +61,7 @@ def is_plane(path: Path, columns: Columns | None = None) -> bool:
     head = head_of(path, columns)
     if head is None or clock_of(head.names) is None or is_poses(path, columns):
         return False
-    return any(places_of(head.names, each) is not None for each in (PLACES, (SPEEDS, TURNS)))
+    return len(state_columns(head.names, POSE, PLAIN)) == len(POSE) or bool(rates_in(head.names))
 
 
 def trajectory_files(folder: Path, columns: Columns | None = None) -> list[Path]:
@@ -80,6 +78,55 @@ def table_files(folder: Path) -> list[Path]:
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+
+
+def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
+    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
+    truth = r.truth
+    if not estimates.is_dir():
+        for option, path in (("--truth", truth), ("--covariance", covariance)):
+            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
+                raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
+        return [(estimates, truth or estimates, covariance)]
+    files = trajectory_files(estimates, r.columns)
+    if not files:
+        raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
+    stems = [path.stem for path in files]
+    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
+        raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
+    if covariance is not None and not covariance.is_dir():
+        raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
+    out = []
+    for path in files:
+        own_truth = path
+        own_covariance = None
+        if truth is not None:
+            own_truth = paired(truth, path, "--truth")
+        if covariance is not None:
+            own_covariance = paired(covariance, path, "--covariance")
+        out.append((path, own_truth, own_covariance))
+    return out
+
+
+def paired(other: Path, path: Path, option: str, kind: str = "file '{}' with .txt or .tum, or table,") -> Path:
+    """What goes with a file of a run: the file of the same name in another folder; a file or a drive goes with all.
+
+    Raises
+    ------
+    InputError
+        The folder holds no such file.
+    """
+    if is_drive(other) or not other.is_dir():
+        return other
+    if is_drive(other / path.stem):
+        return other / path.stem
+    for file in (*trajectory_files(other), *table_files(other)):
+        if file.stem == path.stem:
+            return file
+    if (other / path.name).is_file():
+        return other / path.name
+    what = f"holds no {kind.format(path.stem)} for {path}"
+    raise InputError(f"{option} {other}: {what}; files of the two folders are paired by name")
 
 
 def fitted_note(path: Path) -> str:

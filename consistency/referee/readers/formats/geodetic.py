@@ -15,7 +15,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.text_blocks import LineParser, Lines, increasing, parsed
 from consistency.referee.types import Array
 
-A, F = 6378137.0, 1.0 / 298.257223563  # m and 1: semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)
+A = 6378137.0  # m, semi-major axis of WGS 84 (NIMA TR8350.2, table 3.1)
+F = 1.0 / 298.257223563  # its flattening
 E2 = F * (2.0 - F)
 GPS = dt.datetime(1980, 1, 6)  # begin of its weeks
 UNIX = dt.datetime(1970, 1, 1)
@@ -73,8 +74,9 @@ def centred(place: Array) -> Array:
     phi = np.deg2rad(latitude)
     lam = np.deg2rad(longitude)
     N = A / np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
-    out = [(N + height) * np.cos(phi) * np.cos(lam), (N + height) * np.cos(phi) * np.sin(lam)]
-    return np.stack([*out, (N * (1.0 - E2) + height) * np.sin(phi)], axis=-1)
+    out = (N + height) * np.cos(phi)
+    z = (N * (1.0 - E2) + height) * np.sin(phi)
+    return np.stack([out * np.cos(lam), out * np.sin(lam), z], axis=-1)
 
 
 def geodetic(point: Array) -> Array:
@@ -86,9 +88,12 @@ def geodetic(point: Array) -> Array:
     p = np.hypot(x, y)
     phi = np.arctan2(z, (1.0 - E2) * np.hypot(x, y))
     for _ in range(8):
-        phi = np.arctan2(z + E2 * A * np.sin(phi) / np.sqrt(1.0 - E2 * np.sin(phi) ** 2), p)
-    height = p * np.cos(phi) + z * np.sin(phi) - A * np.sqrt(1.0 - E2 * np.sin(phi) ** 2)
-    return np.stack([np.rad2deg(phi), np.rad2deg(np.arctan2(y, x)), height], axis=-1)
+        s = np.sin(phi)
+        phi = np.arctan2(z + E2 * A * s / np.sqrt(1.0 - E2 * s**2), p)
+    s = np.sin(phi)
+    height = p * np.cos(phi) + z * s - A * np.sqrt(1.0 - E2 * s**2)
+    lam = np.arctan2(y, x)
+    return np.stack([np.rad2deg(phi), np.rad2deg(lam), height], axis=-1)
 
 
 def axes_at(place: Array) -> Array:
@@ -99,8 +104,10 @@ def axes_at(place: Array) -> Array:
     sl = np.sin(longitude)
     cl = np.cos(longitude)
     zero = np.zeros_like(latitude)
-    rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    east = np.stack([-sl, cl, zero], axis=-1)
+    north = np.stack([-s * cl, -s * sl, c], axis=-1)
+    up = np.stack([c * cl, c * sl, s], axis=-1)
+    return np.stack([east, north, up], axis=-2)
 
 
 def _turned(R: Array, P: Array) -> Array:
@@ -128,7 +135,8 @@ def _plain(lines: Lines, origin: Array) -> Lines:
     if not isinstance(lines, Fixes):
         return lines
     place, P = lines.local(origin)
-    return replace(lines, values=np.column_stack([lines.t, place, P.reshape(-1, 9)]), geodetic=False)
+    values = np.column_stack([lines.t, place, P.reshape(-1, 9)])
+    return replace(lines, values=values, geodetic=False)
 
 
 # --- RTKLIB ------------------------------------------------------------------------------------------
@@ -251,8 +259,10 @@ def leap_seconds(t: float) -> int:
 def _clock_note(clock: str, t: Array) -> str:
     if clock != "GPST":
         return f"times of {clock} as UTC"
-    first = next(k for k in range(len(LEAPS) + 1) if leap_seconds(t[0] + k) == k)
-    return f"times of GPS as UTC, {first} leap seconds less"
+    count = 0
+    while leap_seconds(t[0] + count) != count:
+        count += 1
+    return f"times of GPS as UTC, {count} leap seconds less"
 
 
 def _qualities(columns: dict[str, Array]) -> str:

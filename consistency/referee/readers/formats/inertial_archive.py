@@ -53,8 +53,9 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
     for part in parts:
         own[part] = _part(path, arrays, part)
         true[part] = _part(path, arrays, TRUE + part)
-        if own[part].shape != true[part].shape or own[part].shape[:2] != own["R"].shape[:2]:
-            shapes = f"{own[part].shape} and {true[part].shape}, beside R {own['R'].shape}"
+        shape = own[part].shape
+        if shape != true[part].shape or shape[:2] != own["R"].shape[:2]:
+            shapes = f"{shape} and {true[part].shape}, beside R {own['R'].shape}"
             raise InputError(f"{path}: keys '{part}' and '{TRUE}{part}' have shapes {shapes}")
         if not np.isfinite(true[part]).all():
             raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
@@ -65,7 +66,10 @@ def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | N
     error = np.full((*finite.shape, 3 * len(states)), np.nan)
     error[finite] = state_error(truth[finite], estimate[finite], convention)
     places = [3 * states.index(part) + i for part in order for i in range(3)]
-    rest = {key: array for key, array in arrays.items() if key.removeprefix(TRUE) not in (*AXES, "order")}
+    rest = {}
+    for key, array in arrays.items():
+        if key.removeprefix(TRUE) not in (*AXES, "order"):
+            rest[key] = array
     rest["errors"] = error[..., places]
     rest["axes"] = np.array([AXES[part] for part in order]).ravel()
     of = "and the difference of the velocity"

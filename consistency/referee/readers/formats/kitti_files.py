@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
+from consistency.referee.geometry.lie_groups import inverse, vectors
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
 from consistency.referee.readers.formats.pose_rows import on_plane
 from consistency.referee.readers.formats.rotations import are_rotations
@@ -131,10 +132,9 @@ def read_drive(folder: Path, body: str | None = None) -> Lines:
     if body not in (None, *BODIES):
         raise InputError(f"--body {body}: must be one of {', '.join(BODIES)}")
     stamps, poses = drive_poses(folder, body or "imu")
-    poses = np.linalg.inv(poses[0]) @ poses
-    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     t = (stamps - stamps[0]) * NANO
-    return Lines(folder, np.column_stack([t, poses[:, :3, 3], quaternion]), np.arange(1, len(t) + 1))
+    values = np.column_stack([t, vectors(inverse(poses[:1]) @ poses)])
+    return Lines(folder, values, np.arange(1, len(t) + 1))
 
 
 def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
@@ -149,7 +149,8 @@ def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
         raise InputError(f"{oxts}: timestamps.txt has {len(stamps)} lines, but data {len(files)} packets")
     packets = np.array([_packet(file) for file in files])
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]]).as_matrix()  # Rz(yaw) Ry(pitch) Rx(roll)
+    attitude = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]])  # Rz(yaw) Ry(pitch) Rx(roll)
+    poses[:, :3, :3] = attitude.as_matrix()
     poses[:, :3, 3] = mercator(packets[:, :3])
     return stamps, poses @ np.linalg.inv(_mount(folder, body))
 
@@ -178,7 +179,8 @@ def _packet(path: Path) -> list[float]:
         values = [float(field) for field in fields]
     if len(values) != FIELDS:
         raise InputError(f"{path}: has {len(values)} numbers; a packet of KITTI has {FIELDS}")
-    if not np.isfinite(values[:6]).all() or abs(values[0]) > POLE or abs(values[1]) > 180.0:
+    is_place = abs(values[0]) <= POLE and abs(values[1]) <= 180.0
+    if not (is_place and np.isfinite(values[:6]).all()):
         raise InputError(f"{path}: begins with {fields[0]} {fields[1]}; should be latitude and longitude in degrees")
     return values[:6]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     """
     arrays = load_arrays(path)
     if poses_alone:
-        return [_poses_of(Archive(path, arrays))]
+        return [_poses_of_arrays(Archive(path, arrays))]
     if not set(arrays) >= OF_STATES:
         return [estimator_of_arrays(path, arrays, r)]
     from consistency.referee.readers.formats.inertial_archive import extended_errors
@@ -67,7 +67,7 @@ def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
 # --- estimators and records --------------------------------------------------------------------------
 
 
-def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Estimator | Record:
+def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
     archive = Archive(path, arrays)
     kind = _kind(archive, r)
@@ -75,47 +75,44 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
         found = _of_nees(archive)
         assert found.nees is not None
         return replace(found, by=archive.groups(r, found.nees.shape))
+    declared = ""
     if kind == OF_ERRORS:
         truth = archive.array("errors", 3)
-        declared = ""
         estimates = np.where(np.isfinite(truth), 0.0, np.nan)
     else:
         estimates, truth = archive.estimates_and_truth()
         declared = _convention(archive, r, estimates.shape[-1])
     runs, steps, n = estimates.shape
+    shape = (runs, steps, n, n)
     by = archive.groups(r, (runs, steps))
-    covariances = archive.matrices("covariances", (runs, steps, n, n))
+    covariances = archive.matrices("covariances", shape)
     there = archive.known(runs, steps)
     if kind == OF_POSES:
         truth = _finite_truth(path, estimates, truth, there)
-    convention = declared or "vector"
     nis, dof = archive.nis((runs, steps))
     of_truth = cross = None
-    if "truth_covariances" in arrays:
-        of_truth = archive.matrices("truth_covariances", covariances.shape)
-    if "cross_covariances" in arrays and r.relative is not None and not r.motions:
-        cross = archive.matrices("cross_covariances", covariances.shape)
-    clock = archive.times(steps)
-    axes = archive.axes(n)
+    if "truth_covariances" in archive:
+        of_truth = archive.matrices("truth_covariances", shape)
+    if "cross_covariances" in archive and r.relative is not None and not r.motions:
+        cross = archive.matrices("cross_covariances", shape)
+    convention = declared or "vector"
     poses = []
-    if r.relative is not None:  # poses, or motions of them
-        axes = PLANAR_POSE
-    for one in _runs(archive, estimates, truth, there, clock):
-        its = (one.run, slice(len(one.t)))
-        rows = np.flatnonzero(there[one.run, : len(one.t)])
+    for one in _runs(archive, estimates, truth, there):
+        steps_of_run = (one.run, slice(len(one.t)))
+        rows = np.flatnonzero(there[steps_of_run])
         place = one.place.at(rows).__getitem__
-        P = np.full(covariances[its].shape, np.nan)
-        T = None
+        P = np.full((len(one.t), n, n), np.nan)
         P[rows] = symmetric(covariances[one.run, rows], place)
+        T = None
         if of_truth is not None:
             T = symmetric(of_truth[one.run, rows], place)
-        poses.append(
-            replace(
-                one, covariance=P, stated=np.ones(len(P), bool), manifold=manifold_of(convention), name="",
-                convention=convention, true_covariance=T, nis=at(nis, its), nis_dof=at(dof, its),
-                cross=at(cross, its), by=at(by, its),
-            )
-        )  # fmt: skip
+        of_steps = {"nis": nis, "nis_dof": dof, "cross": cross, "by": by}
+        own: dict[str, Any] = {key: at(values, steps_of_run) for key, values in of_steps.items()}
+        stated = np.ones(len(P), bool)
+        manifold = manifold_of(convention)
+        own |= {"covariance": P, "stated": stated, "true_covariance": T, "manifold": manifold, "convention": convention}
+        poses.append(replace(one, **own))
+    axes = archive.axes(n)
     causes = []
     if convention == "vector":
         remedy = "wrap it to [-pi, pi]"
@@ -123,7 +120,10 @@ def estimator_of_arrays(path: Path, arrays: dict[str, Array], r: Reading) -> Est
             remedy = "add --error so2, if these are x, y, heading"
         gap = np.where(there[..., None], truth - estimates, np.nan)
         causes = turns(path.stem, axes, gap, covariances, remedy)
-    return Estimator(path.stem, path, poses, axes, declared, PLANAR.get(declared, ""), causes=causes, t=clock)
+    if r.relative is not None:  # poses, or motions of them
+        axes = PLANAR_POSE
+    definition = PLANAR.get(declared, "")
+    return Estimator(path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps))
 
 
 def _kind(archive: Archive, r: Reading) -> tuple[str, ...]:
@@ -176,42 +176,48 @@ def _finite_truth(path: Path, estimates: Array, truth: Array, known: Array) -> A
     return truth if finite.all() else np.where(finite[..., None], truth, 0.0)
 
 
-def _poses_of(archive: Archive) -> Estimator:
+def _poses_of_arrays(archive: Archive) -> Estimator:
     """Planar poses of an archive with the keys ``estimates`` and ``truth``."""
     path = archive.path
     for key in ("estimates", "truth"):
         if key not in archive:
             raise InputError(f"{path}: key '{key}' is missing; needs estimates and truth, (runs, steps, 3)")
-    estimates = archive.array("estimates", 3)
-    truth = archive.array("truth", 3)
-    if estimates.shape != truth.shape or estimates.shape[-1] != 3:
+    estimates, truth = archive.estimates_and_truth()
+    runs, steps, n = estimates.shape
+    if n != 3:
         raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
-    runs, steps, _ = estimates.shape
     there = archive.known(runs, steps) & np.isfinite(truth).all(axis=-1)
-    clock = archive.times(steps)
-    poses = [replace(one, run=0) for one in _runs(archive, estimates, truth, there, clock)]
-    return Estimator(path.stem, path, poses, PLANAR_POSE, t=clock)
+    poses = list(_runs(archive, estimates, truth, there))
+    return Estimator(path.stem, path, poses, PLANAR_POSE, t=archive.times(steps))
 
 
-def _runs(archive: Archive, estimates: Array, truth: Array, there: Array, clock: Array) -> Iterator[Poses]:
+def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Iterator[Poses]:
     """Estimates (runs, steps, n) and their truth where it is ``there``, without covariances, in the plane."""
     path = archive.path
     runs, steps, n = estimates.shape
+    clock = archive.times(steps)
     for run, length in enumerate(archive.lengths(runs, steps)):
+        t = np.arange(float(length))
+        covariance, stated = unstated(length, n)
+        beside = Poses(
+            place=steps_of(path, run, np.arange(length)),
+            t=t,
+            estimate=estimates[run, :length],
+            covariance=covariance,
+            stated=stated,
+            true_t=t,
+            truth=truth[run, :length],
+            manifold="planar",
+            convention="left",
+            max_dt=0.0,
+            run=run,
+            name=path.stem if runs == 1 else f"run {run}",
+            files=(path, path),
+            numbered=True,
+            clock=clock[:length],
+        )
         known = there[run, :length]
-        own_truth = truth[run, :length]
-        t = true_t = np.arange(float(length))
-        if not known.all():
-            true_t = t[known]
-            own_truth = own_truth[known]
-        place = steps_of(path, run, np.arange(length))
-        name = f"run {run}"
-        if runs == 1:
-            name = path.stem
-        yield Poses(
-            place, t, estimates[run, :length], *unstated(length, n), true_t, own_truth, "planar", "left", 0.0, run=run,
-            name=name, files=(path, path), numbered=True, clock=clock[:length],
-        )  # fmt: skip
+        yield beside if known.all() else beside.beside(np.flatnonzero(known))
 
 
 def _of_nees(archive: Archive) -> Record:
@@ -241,6 +247,14 @@ def _of_nees(archive: Archive) -> Record:
             nees[run, step:] = np.nan
             failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
     return Record(
-        path.stem, nees=nees, dof=n, nis=nis, nis_dof=nis_dof, failures=tuple(failures), axes=archive.axes(n),
-        runs=np.arange(runs), t=archive.times(steps), **by_step,
-    )  # fmt: skip
+        path.stem,
+        nees=nees,
+        dof=n,
+        nis=nis,
+        nis_dof=nis_dof,
+        failures=tuple(failures),
+        axes=archive.axes(n),
+        runs=np.arange(runs),
+        t=archive.times(steps),
+        **by_step,
+    )

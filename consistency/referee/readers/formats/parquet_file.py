@@ -44,7 +44,8 @@ def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"{path}: column '{one_line(twice[0])}' is duplicated")
     with reading(path, refusal):
-        return {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}, table.num_rows
+        columns = {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}
+        return columns, table.num_rows
 
 
 def _cells(name: str, column: Any) -> Array:

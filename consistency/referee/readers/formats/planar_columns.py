@@ -7,68 +7,60 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.column_names import COVARIANCE, POSE
+from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.clock_units import UNIT_NAMES
-from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.columns import rates_in, state_columns
 from consistency.referee.readers.formats.file_head import head_of
-from consistency.referee.readers.formats.file_kinds import PLACES, SPEEDS, TURNS, is_poses
-from consistency.referee.readers.formats.named_columns import TRUE, clock_of, places_of
-from consistency.referee.readers.formats.other_names import covariance_places, state_places
-from consistency.referee.readers.formats.pose_rows import on_plane, read_named, read_poses, times_of
-from consistency.referee.readers.formats.sheet import TableRows
-from consistency.referee.readers.formats.table_columns import LOWER_NAMES
-from consistency.referee.readers.formats.text_blocks import increasing
+from consistency.referee.readers.formats.file_kinds import is_poses
+from consistency.referee.readers.formats.pose_rows import on_plane, read_poses
+from consistency.referee.readers.formats.sheet import OF_ONE_RUN, TableRows, sheet_of
+from consistency.referee.readers.formats.spellings import PLAIN, Columns, clock_of, require_units
+from consistency.referee.readers.formats.table_columns import times_of
 from consistency.referee.types import Array
 
 
 def read_plane(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
-    """Planar poses t, x, y, heading of a file, and what it was read as.
+    """A table with planar poses t, x, y, heading of a file that holds them otherwise, and what it was read as.
 
     Speeds and turn rates are integrated, each held from its row to the next: to the motion since the row before, in
     the frame of the body there, with ``motions``; else to poses from (0, 0, 0) on. Of poses in space it is the
-    position and the heading of the x axis. Columns of a covariance, ``P_xx`` and so on, are kept.
+    position and the heading of the x axis.
 
     Raises
     ------
     InputError
-        The file holds none of these, or its timestamps do not increase.
+        Speeds are of several runs, or a row cannot be read.
     """
     if is_poses(path, columns):
         lines = read_poses(path, true=True, columns=columns)
         of = lines.note or f"{path}: read as poses in space"
         return on_plane(lines, "line"), f"{of}, of which the heading is that of the x axis"
     head = head_of(path, columns)
-    clock = None if head is None else clock_of(head.names)
-    if head is None or clock is None:
-        raise InputError(f"{path}: needs names of columns, t with x, y, heading, or t with v, omega")
+    assert head is not None
     names = head.names
-    times, stated_unit = clock
-    poses = places_of(names, PLACES)
-    rates = places_of(names, (SPEEDS, TURNS))
-    moving = poses or rates
-    if moving is None:
-        raise InputError(f"{path}: holds no x, y, heading and no v, omega; there are: {', '.join(names[:12])}")
-    kept = [name for name in (*COVARIANCE, *LOWER_NAMES.values()) if name in names]
-    for place in (covariance_places(names, POSE) | state_places(names, POSE, TRUE)).values():
-        kept.append(names[place])
-    kept = list(dict.fromkeys(kept))
-    lines, values = read_named(path, head, (*times, *moving, *map(names.index, kept)), columns)
-    t, unit = times_of(lines, times, values[: len(times)], stated_unit)
-    values = values[len(times) :]
-    pose = np.column_stack(values[: len(moving)])
+    clock = clock_of(names)
+    assert clock is not None
+    poses = state_columns(names, POSE, PLAIN)
+    are_poses = len(poses) == len(POSE)
+    moving = tuple(poses.values()) if are_poses else rates_in(names)
+    require_units([names[place] for place in (*clock.places, *moving)], path)
+    sheet = sheet_of(path, head, columns)
+    t, unit = times_of(sheet, clock, [sheet.numbers(names[place]) for place in clock.places])
+    pose = sheet.matrix(names[place] for place in moving)
     of = "planar poses"
-    if poses is None:
+    if not are_poses:
+        if "run" in sheet or "filter" in sheet:
+            raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
         what = "motions" if motions else "poses"
         of = f"speed and turn rate, each held until the next, integrated to {what}"
         pose = motions_of(t, *pose.T)
         if not motions:
             pose = poses_of(pose)
-    rows = increasing(replace(lines, values=np.column_stack([t, pose, *values[len(moving) :]])))
-    data = dict(zip(["t", *POSE, *kept], rows.values.T, strict=True))
+    data = dict(zip(["t", *POSE], [t, *pose.T], strict=True))
     note = f"{path}: read as {of}, {len(names)} columns, {UNIT_NAMES[unit]}"
-    return TableRows(path, data, rows.line, "line", rows.open_line, rows.cut), note
+    return replace(sheet, data=sheet.data | data), note
 
 
 def motions_of(t: Array, v: Array, omega: Array) -> Array:

@@ -10,8 +10,8 @@ from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
+from consistency.referee.readers.formats.columns import is_numbered
 from consistency.referee.readers.formats.file_head import head_of
-from consistency.referee.readers.formats.named_columns import numbered
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POSE, SPLIT, TRIANGLE
 from consistency.referee.readers.formats.text_blocks import Lines, read_numbers
 from consistency.referee.readers.options import Reading
@@ -43,7 +43,8 @@ def covariances_in(lines: Lines, order: str) -> Array | None:
     if lines.values.shape[1] != SPLIT:
         return _matrices(numbers, order)
     out = np.zeros((len(numbers), 6, 6))  # two triangles: rotation, then position
-    out[:, 3:, 3:], out[:, :3, :3] = _from_triangle(numbers[:, :6], 3), _from_triangle(numbers[:, 6:], 3)
+    out[:, 3:, 3:] = _from_triangle(numbers[:, :6], 3)
+    out[:, :3, :3] = _from_triangle(numbers[:, 6:], 3)
     return out
 
 
@@ -106,7 +107,7 @@ def order_note(path: Path | str, n: int, r: Reading) -> str:
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which} {names}")
     if order is None:
         head = None if n == 6 else head_of(Path(path), r.columns)
-        if n == 6 or (head is not None and not any(map(numbered, head.names))):
+        if n == 6 or (head is not None and not any(map(is_numbered, head.names))):
             return ""
     return f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"
 

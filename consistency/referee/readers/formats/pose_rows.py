@@ -14,27 +14,24 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.readers.clock_units import UNIT_NAMES, unit_of
-from consistency.referee.readers.formats.column_renaming import Columns
-from consistency.referee.readers.formats.file_head import Head, fields_of, head_of
+from consistency.referee.readers.clock_units import UNIT_NAMES
+from consistency.referee.readers.formats.columns import PoseColumns, pose_columns, true_pose_columns
+from consistency.referee.readers.formats.file_head import Head, head_of
 from consistency.referee.readers.formats.file_kinds import is_solution
 from consistency.referee.readers.formats.geodetic import read_solution
-from consistency.referee.readers.formats.named_columns import (
-    Roles,
-    clock_of,
-    naming,
-    require_units,
-    roles_of,
-    true_roles_of,
-)
 from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
-from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.text_blocks import Lines, blocks, increasing, read_numbers, read_rows
+from consistency.referee.readers.formats.sheet import OF_ONE_RUN, TableRows, sheet_of
+from consistency.referee.readers.formats.spellings import Clock, Columns, clock_of, naming, require_units
+from consistency.referee.readers.formats.table_columns import times_of
+from consistency.referee.readers.formats.text_blocks import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.places import refuse
+from consistency.referee.readers.truth_matching import finite_rows
 from consistency.referee.types import Array, Indices
 
-POSE, SPLIT = 8, 20  # columns: a pose; a pose and two 3 x 3 covariances without a cross-covariance
-FULL, TRIANGLE = 36, 21  # a 6 x 6 covariance row by row, or its upper triangle
+POSE = 8  # columns of a pose
+SPLIT = 20  # of a pose and two 3 x 3 covariances without a cross-covariance
+FULL = 36  # numbers of a 6 x 6 covariance row by row
+TRIANGLE = 21  # of its upper triangle
 POINT = 4  # columns of a truth of positions alone: t, x, y, z
 DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
 DEVIATED = POSE + 6  # columns of a pose and six standard deviations
@@ -62,22 +59,22 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
     if is_solution(path):
         return read_solution(path)
     head = head_of(path, columns)
-    roles = None if head is None else roles_of(head.names, path)
-    if head is None or roles is None or (head.comment and roles.is_tum and len(head.names) in TUM):
+    found = None if head is None else pose_columns(head.names, path)
+    if head is None or found is None or (head.comment and found.is_tum and len(head.names) in TUM):
         return _unnamed(path, true, head)
-    if not (roles.quaternion or true):
+    if not (found.quaternion or true):
         raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}")
-    return _named(path, head, roles, true, columns)
+    return _named(path, head, found, true, columns)
 
 
 def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     """The truth in columns beside the estimates of a file with names, in rows that have one; None without any."""
     head = head_of(path, columns)
-    roles = None if head is None else true_roles_of(head.names, path)
-    if head is None or roles is None or not roles.quaternion:
+    found = None if head is None else true_pose_columns(head.names, path)
+    if head is None or found is None or not found.quaternion:
         return None
-    lines = _named(path, head, roles, True, columns)
-    finite = np.asarray(np.isfinite(lines.values).all(axis=1))
+    lines = _named(path, head, found, True, columns)
+    finite = finite_rows(lines.values)
     return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
 
@@ -96,90 +93,58 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
         )
     ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-    columns = {"t": lines.t, "x": lines.values[:, 1], "y": lines.values[:, 2], "heading": heading}
+    t, x, y = lines.values[:, :3].T
+    columns = {"t": t, "x": x, "y": y, "heading": heading}
     return TableRows(lines.path, columns, lines.line, unit, lines.open_line, lines.cut)
 
 
 # --- columns with names ------------------------------------------------------------------------------
 
 
-def _named(path: Path, head: Head, roles: Roles, true: bool, columns: Columns | None) -> Lines:
+def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Columns | None) -> Lines:
     """Rows under the names of their columns."""
-    pose = (*roles.position, *roles.quaternion)
-    lines, values = read_named(path, head, (*roles.time, *pose, *roles.covariance, *roles.rest), columns)
-    parts = np.cumsum([len(roles.time), len(pose), len(roles.covariance)])
-    times, own, stated, rest = (values[start:end] for start, end in zip([0, *parts], [*parts, None], strict=True))
-    t, unit = times_of(lines, roles.time, times, roles.unit)
-    if roles.squared:
+    sheet = sheet_of(path, head, columns)
+    if "run" in sheet or "filter" in sheet:
+        raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
+    names = head.names
+
+    def numbers(places: Sequence[int]) -> list[Array]:
+        columns = [names[place] for place in places]
+        require_units(columns, path)
+        return list(map(sheet.numbers, columns))
+
+    t, unit = times_of(sheet, found.clock, numbers(found.clock.places))
+    stated = numbers(found.covariance)
+    if found.squared:
         stated = [np.sign(each) * np.sqrt(np.abs(each)) for each in stated]
-    rows = np.column_stack([t, *own, *stated])
-    note = _named_note(path, head, roles, true, UNIT_NAMES[unit])
-    return increasing(replace(lines, values=rows, note=note, rest=np.column_stack(rest) if rest else None))
+    rest = None
+    if found.rest:
+        rest = np.column_stack(numbers(found.rest))
+    pose = numbers(found.position + found.quaternion)
+    values = np.column_stack([t, *pose, *stated])
+    note = _named_note(path, head, found, true, UNIT_NAMES[unit])
+    lines = Lines(path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut)
+    return increasing(lines)
 
 
-def _named_note(path: Path, head: Head, roles: Roles, true: bool, clock: str) -> str:
-    of = roles.kind
+def _named_note(path: Path, head: Head, found: PoseColumns, true: bool, clock: str) -> str:
+    of = found.kind
     order = "no orientation"
     if not true:
         of = of.replace(" truth", " poses")
-    if len(roles.time) == 2:
+    if len(found.clock.places) == 2:
         clock = "seconds and nanoseconds"
-    if roles.quaternion:
-        order = "quaternion w first" if roles.quaternion[3] < roles.quaternion[0] else "quaternion w last"
+    if found.quaternion:
+        order = "quaternion w first" if found.quaternion[3] < found.quaternion[0] else "quaternion w last"
     note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
-    if not roles.covariance:
+    if not found.covariance:
         return note
     stated = "covariance"
-    if roles.squared:
+    if found.squared:
         stated = "variances"
-    elif len(roles.covariance) in DEVIATIONS:
+    elif len(found.covariance) in DEVIATIONS:
         stated = "standard deviations"
-    return f"{note}, {stated} in {len(roles.covariance)} columns"
-
-
-def read_named(
-    path: Path, head: Head, places: Sequence[int], columns: Columns | None = None
-) -> tuple[Lines, list[Array]]:
-    """Some columns of a file with names, and lines that hold none of them yet."""
-    require_units([head.names[place] for place in places], path)
-    if head.comment or head.spaced:
-        header = 0 if head.comment else head.line
-        lines = read_rows(path, [len(head.names)], f"{len(head.names)} columns as named", header)
-        return replace(lines, values=lines.values[:, :0]), [lines.values[:, place] for place in places]
-    sheet = read_sheet(path, columns)
-    if "run" in sheet or "filter" in sheet:
-        raise InputError(f"{path}: column 'run' or 'filter': write such poses to a file for each run and estimator")
-    lines = Lines(path, np.empty((len(sheet), 0)), sheet.line, open_line=sheet.open_line, cut=sheet.cut)
-    names = list(sheet.data)
-    return lines, [sheet.numbers(names[place]) for place in places]
-
-
-def times_of(
-    lines: Lines, places: Sequence[int], columns: Sequence[Array], unit: int | None = None
-) -> tuple[Array, int]:
-    """Times in s, each the number nearest to what the file says, and how many of its units are a second.
-
-    A double does not hold the nanoseconds since 1970, so that they are read again as whole numbers.
-    """
-    unit = 10**9 if len(places) == 2 else unit_of(columns[0], unit)
-    if unit < 10**9:
-        return columns[0] / unit, unit
-    rows = iter(lines.line.tolist())
-    row = next(rows, None)
-    t = []
-    try:
-        for block in blocks(lines.path):
-            for number, line in block.lines():
-                if number == row:
-                    cells = fields_of(line)
-                    *seconds, nanoseconds = (int(cells[place]) for place in places)
-                    t.append((sum(seconds) * unit + nanoseconds) / unit)
-                    row = next(rows, None)
-    except (ValueError, IndexError, OverflowError):
-        if len(places) == 1:
-            return columns[0] / unit, unit
-        return columns[0] + columns[1] / unit, unit
-    return np.array(t), unit
+    return f"{note}, {stated} in {len(found.covariance)} columns"
 
 
 # --- columns without names ---------------------------------------------------------------------------
@@ -217,10 +182,11 @@ def _unnamed(path: Path, true: bool, head: Head | None) -> Lines:
 
 def _asl(lines: Lines, true: bool) -> Lines:
     """The 17 columns of EuRoC without their names."""
-    t, unit = times_of(lines, (0,), [lines.t])
+    t, unit = times_of(lines, Clock((0,), None), [lines.t])
     of = "truth" if true else "poses"
     note = f"{lines.path}: read as EuRoC {of}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
-    values = np.column_stack([t, lines.values[:, [1, 2, 3, 5, 6, 7, 4]]])
+    pose = lines.values[:, [1, 2, 3, 5, 6, 7, 4]]
+    values = np.column_stack([t, pose])
     return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
 
 
@@ -235,8 +201,9 @@ def _are_rigid(numbers: Array) -> Indices:
     M = numbers.reshape(len(numbers), -1, 4)
     right = are_rotations(M[:, :3, :3])
     if M.shape[1] == 4:
-        right &= np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < TOLERANCE
-    return np.asarray(right | ~np.isfinite(numbers).all(axis=1))
+        off = np.abs(M[:, 3] - [0.0, 0.0, 0.0, 1.0])
+        right &= off.max(axis=1) < TOLERANCE
+    return np.asarray(right | ~finite_rows(numbers))
 
 
 def _matrices(lines: Lines) -> Lines:
@@ -247,15 +214,16 @@ def _matrices(lines: Lines) -> Lines:
     t, clock = _clock(lines, before)
     M = numbers.reshape(len(numbers), -1, 4)
     quaternion = quaternions(M[:, :3, :3])
-    quaternion[~np.isfinite(numbers).all(axis=1)] = np.nan
+    quaternion[~finite_rows(numbers)] = np.nan
     note = f"{lines.path}: read as matrices of {M.shape[1]} x 4, {lines.values.shape[1]} columns, {clock}"
-    return increasing(replace(lines, values=np.column_stack([t, M[:, :3, 3], quaternion, covariance]), note=note))
+    values = np.column_stack([t, M[:, :3, 3], quaternion, covariance])
+    return increasing(replace(lines, values=values, note=note))
 
 
 def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     """Times of matrices: those before them, those of times.txt in the same folder, or their numbers from 0 on."""
     if before.shape[1]:
-        t, unit = times_of(lines, (0,), [before[:, 0]])
+        t, unit = times_of(lines, Clock((0,), None), [before[:, 0]])
         if (t == np.round(t)).all():
             return t, "the first one the number of the step"
         return t, f"the first one the time in {UNIT_NAMES[unit]}"
@@ -319,4 +287,5 @@ def _has_cameras(values: Array, column: int, each: int) -> bool:
     """Whether a column holds a number of cameras, of which there are so many numbers each in the columns behind it."""
     cameras = values[:, column]
     width = column + 1 + each * cameras
-    return bool(((cameras >= 1) & (cameras == np.round(cameras)) & (width <= values.shape[1])).all())
+    are_numbers = (cameras >= 1) & (cameras == np.round(cameras))
+    return bool((are_numbers & (width <= values.shape[1])).all())

@@ -10,20 +10,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.lie_groups import propagated
+from consistency.referee.geometry.lie_groups import matrices, propagated, to_left
 from consistency.referee.readers.alignment.world_frames import skew
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import AXES, Poses
+from consistency.referee.readers.truth_matching import AXES, Poses, finite_rows
 from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
 FEWEST = 3  # estimates of a run
-TURNED, BEYOND = 0.5, 10.0  # rad and sigma: a turn that is not an error of a constant orientation
-WINDING, ALIGNED = 0.01, 0.25  # 1 less the mean direction of a path, and the part of it that is left in the body's axes
+TURNED = 0.5  # rad: a turn that is not an error of a constant orientation
+BEYOND = 10.0  # sigma, likewise
+WINDING = 0.01  # 1 less the mean direction of a path
+ALIGNED = 0.25  # the part of it that is left in the body's axes
 
 
 def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
@@ -54,7 +55,7 @@ def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
     return f"{truth}: the truth has no orientation, so that the position alone is judged, of {at}"
 
 
-def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Poses:
+def point_positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Poses:
     """Estimated positions p + R l of a point of the body beside its true ones, with their covariances to first order.
 
     Parameters
@@ -73,18 +74,24 @@ def positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -> Pose
         option = "--lever-arm" if arm.any() else "--error right"
         what = "moves errors of the rotation into that of the position, whose cross terms are not stated"
         raise InputError(f"{poses.place[0]}: {option} {what}; give covariances of whole poses")
-    R = np.full((len(poses.t), 3, 3), np.nan)
-    finite = np.isfinite(poses.estimate).all(axis=1)
-    if finite.any():
-        R[finite] = Rotation.from_quat(poses.estimate[finite, 3:]).as_matrix()
-    point = poses.estimate[:, :3] + R @ arm
+    T = np.full((len(poses.t), 4, 4), np.nan)
+    finite = finite_rows(poses.estimate)
+    T[finite] = matrices(poses.estimate[finite, :7])
+    point = poses.estimate[:, :3] + T[:, :3, :3] @ arm
     of_truth = poses.true_covariance
     if of_truth is not None:
         of_truth = of_truth[:, :3, :3]
+    J = _jacobian(poses.convention, T, arm)
     return replace(
-        poses, estimate=point, covariance=propagated(_jacobian(poses.convention, R, arm, point), poses.covariance),
-        truth=poses.truth[:, :3], manifold="vector", convention="vector", cross=None, true_covariance=of_truth,
-    )  # fmt: skip
+        poses,
+        estimate=point,
+        covariance=propagated(J, poses.covariance),
+        truth=poses.truth[:, :3],
+        manifold="vector",
+        convention="vector",
+        cross=None,
+        true_covariance=of_truth,
+    )
 
 
 def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
@@ -103,13 +110,19 @@ def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
     turns = [turn for one in poses if (turn := _turning(one)) is not None]
     if not turns or np.median([turn[0] for turn in turns]) < TURNED:
         return False, ""
-    angle, of_way, of_body = np.transpose(turns)
+    angle, *lengths = np.transpose(turns)
     text = "the truth has the same orientation in every row, while the estimates turn by"
     text = f"{text} {np.rad2deg(np.median(angle)):.0f} degrees"
-    way, body = (1.0 - np.nanmean(each) if np.isfinite(each).any() else 0.0 for each in (of_way, of_body))
+    way, body = map(_winding, lengths)
     if way > WINDING and body < ALIGNED * way:
         return True, f"{text} with the path: it is read as positions alone"
     return False, f"{text}; if it is a placeholder, give a truth of t x y z, or judge --axes x,y,z"
+
+
+def _winding(lengths: Array) -> float:
+    """1 - the mean length of mean directions; 0 where nothing moves."""
+    known = lengths[np.isfinite(lengths)]
+    return 1.0 - float(known.mean()) if len(known) else 0.0
 
 
 def _turning(one: Poses) -> tuple[float, float, float] | None:
@@ -119,13 +132,14 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
     too few rows have a truth.
     """
     known = one.known()
-    finite = np.isfinite(one.estimate[known.rows]).all(axis=1)
+    finite = finite_rows(one.estimate[known.rows])
     rows = known.rows[finite]
     true = known.truth[finite, :3]
     if len(rows) < FEWEST:
         return None
     R = Rotation.from_quat(one.estimate[rows, 3:7])
-    sigma = np.sqrt(np.abs(np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)))
+    variance = np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)
+    sigma = np.sqrt(np.abs(variance))
     turned = (R[0].inv() * R).magnitude()
     turn = float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0)))
     way = np.diff(true, axis=0)
@@ -135,7 +149,8 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
         return turn, np.nan, np.nan
     way = way[moving] / size[moving, None]
     in_body = R[:-1][moving].inv().apply(way)
-    return turn, float(np.linalg.norm(way.mean(axis=0))), float(np.linalg.norm(in_body.mean(axis=0)))
+    of_way = float(np.linalg.norm(way.mean(axis=0)))
+    return turn, of_way, float(np.linalg.norm(in_body.mean(axis=0)))
 
 
 def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) -> Poses:
@@ -156,19 +171,22 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
         of_truth = of_truth[:, :3, :3]
     P = symmetric(own.covariances, own.place)
     return Poses(
-        Places(own.place, np.arange(len(own.t))), own.t, own.values[:, 1:4], P, np.ones(len(own.t), bool),
-        true.t, true.values[:, 1:4], "vector", "vector", r.tolerance, true_covariance=of_truth,
-    )  # fmt: skip
+        place=own.places,
+        t=own.t,
+        estimate=own.values[:, 1:4],
+        covariance=P,
+        stated=np.ones(len(P), bool),
+        true_t=true.t,
+        truth=true.values[:, 1:4],
+        manifold="vector",
+        convention="vector",
+        max_dt=r.tolerance,
+        true_covariance=of_truth,
+    )
 
 
-def _jacobian(convention: str, R: Array, arm: Array, point: Array) -> Array:
-    """Error of the point by the error of the pose, (N, 3, 6): derivatives of each convention at 0."""
-    J = np.empty((len(R), 3, 6))
-    J[:, :, :3] = R if convention == "left" else np.eye(3)
-    if convention == "right":
-        J[:, :, 3:] = -skew(point)
-    elif convention == "so3":
-        J[:, :, 3:] = -skew(R @ arm)
-    else:
-        J[:, :, 3:] = -R @ skew(arm)
-    return J
+def _jacobian(convention: str, T: Array, arm: Array) -> Array:
+    """Error of the point by the error of the pose, (N, 3, 6): R (rho - arm x phi) by its left error (rho, phi)."""
+    R = T[:, :3, :3]
+    by_left = np.concatenate([R, -R @ skew(arm)], axis=-1)
+    return np.asarray(by_left @ to_left(T, convention))

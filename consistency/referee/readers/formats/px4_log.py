@@ -14,8 +14,14 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.formats.innovation_files import NisLog, choose, numbered_log
-from consistency.referee.readers.formats.logged_innovations import MICRO, Pairs, require_in_order
+from consistency.referee.readers.formats.innovation_files import (
+    MICRO,
+    NisLog,
+    Pairs,
+    choose,
+    numbered_log,
+    require_in_order,
+)
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.column_names import POSE
+from consistency.referee.readers.formats.columns import covariance_columns, pose_columns
 from consistency.referee.readers.formats.file_head import fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
+    files_of_runs,
     is_bag,
     is_plane,
     is_solution,
@@ -20,19 +23,15 @@ from consistency.referee.readers.formats.file_kinds import (
     table_files,
     trajectory_files,
 )
-from consistency.referee.readers.formats.named_columns import DEVIATIONS, roles_of
-from consistency.referee.readers.formats.other_names import covariance_places
 from consistency.referee.readers.formats.pose_covariances import ORDERS, components_in, covariance_order
-from consistency.referee.readers.formats.pose_rows import DEVIATED, FULL, TRIANGLE
-from consistency.referee.readers.formats.pose_rows import DEVIATIONS as SIZES
-from consistency.referee.readers.formats.pose_rows import POSE as POSE_COLUMNS
-from consistency.referee.readers.formats.table_columns import LOWER_NAMES, OWN_NAMES, POSE
+from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, TRIANGLE
+from consistency.referee.readers.formats.pose_rows import POSE as POSE_NUMBERS
 from consistency.referee.readers.formats.text_blocks import opened
-from consistency.referee.readers.formats.tum import files_of_runs
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE
 
-Change = Callable[[int, str], Mapping[str, tuple[float, float]] | None]  # run, value of --by: factors of components
+Factors = Mapping[str, tuple[float, float]]  # factor and floor of a component by name
+Change = Callable[[int, str], Factors | None]  # by run and value of --by; None leaves a line out
 QUOTED = r'(?=(?:[^"]*"[^"]*")*[^"]*$)'  # a place with an even number of quotes after it
 
 
@@ -55,7 +54,10 @@ class TextFile:
             lines = file.read().decode("utf-8-sig").splitlines(keepends=True)
         head = head_of(self.path)
         first = 0 if head is None else head.line
-        return "".join([*lines[:first], *(self._line(line, change) for line in lines[first:])])
+        text = lines[:first]
+        for line in lines[first:]:
+            text.append(self._line(line, change))
+        return "".join(text)
 
     def _line(self, line: str, change: Change) -> str:
         """A line with its covariance restated, and no other change; "" where its run or estimator is left out."""
@@ -70,35 +72,40 @@ class TextFile:
         if '"' in text:  # a separator between quotes is none
             between += QUOTED
         parts = re.split(f"({between})", text)
-        restated = self._restated(parts[::2], change)
+        restated = self._fields(parts[::2], change)
         if not restated:
             return ""
         parts[::2] = restated
         return line.replace(text, "".join(parts), 1)
 
-    def _restated(self, fields: list[str], change: Change) -> list[str]:
+    def _fields(self, fields: list[str], change: Change) -> list[str]:
         """Fields of a line with its covariance restated; none where its run or estimator is left out."""
         bare = [field.strip(' "') for field in fields]
         if self.filter_column is not None and bare[self.filter_column] != self.filter:
             return []
-        run = self.run if self.run_column is None else int(float(bare[self.run_column]))
-        of = change(run, "" if self.by_column is None else bare[self.by_column])
-        if of is None:
+        run = self.run
+        value = ""
+        if self.run_column is not None:
+            run = int(float(bare[self.run_column]))
+        if self.by_column is not None:
+            value = bare[self.by_column]
+        factors = change(run, value)
+        if factors is None:
             return []
-        out = list(fields)
+        restated = list(fields)
         for column, (a, b) in self.entries.items():
-            if not bare[column]:
-                continue
-            value = float(bare[column])
-            (factor, floor), (other, _) = of.get(a, (1.0, 0.0)), of.get(b, (1.0, 0.0))
-            if not self.squared:
-                value = float(np.sqrt(factor * value**2 + floor))
-            else:
-                value *= float(np.sqrt(factor * other))
-                if a == b:
-                    value += floor
-            out[column] = repr(value)
-        return out
+            if bare[column]:
+                restated[column] = repr(self._number(float(bare[column]), a, b, factors))
+        return restated
+
+    def _number(self, value: float, a: str, b: str, factors: Factors) -> float:
+        """A number of the covariance of two components, restated."""
+        factor, floor = factors.get(a, (1.0, 0.0))
+        other, _ = factors.get(b, (1.0, 0.0))
+        if not self.squared:
+            return float(np.sqrt(factor * value * value + floor))
+        product = value * float(np.sqrt(factor * other))
+        return product + floor if a == b else product
 
 
 def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
@@ -112,81 +119,66 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
         return []
     if r.columns or r.world or r.body_axes:  # names and axes of the file are not those of the record
         return []
-    by = r.by if r.by_file is None else None
-    axes = tuple(r.state or POSE)
+    found: list[TextFile | None] = []
     if estimates.is_dir() and table_files(estimates) and (r.state or not trajectory_files(estimates)):
-        found = [_table(path, axes, name, by, run) for run, path in enumerate(table_files(estimates))]
+        for run, path in enumerate(table_files(estimates)):
+            found.append(_table(path, r, name, run))
     elif estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
-        found = [_table(estimates, axes, name, by)]
+        found.append(_table(estimates, r, name))
     elif is_plane(estimates):
         return []
-    elif r.covariance is not None:
-        runs = files_of_runs(estimates, r, r.covariance)
-        found = [_covariances(path, run, r) for run, (_, _, path) in enumerate(runs) if path is not None]
     else:
-        found = [_trajectory(own, run, r) for run, (own, _, _) in enumerate(files_of_runs(estimates, r, None))]
+        for run, (own, _, covariance) in enumerate(files_of_runs(estimates, r, r.covariance)):
+            found.append(_trajectory(own, run, r) if covariance is None else _numbers(covariance, 1, run, r))
     known = [each for each in found if each is not None]
     return known if len(known) == len(found) else []
 
 
-def _table(path: Path, axes: tuple[str, ...], name: str, by: str | None, run: int | None = None) -> TextFile | None:
+def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFile | None:
     """A table, whose first line names its columns; of one ``run`` where that is given."""
     head = head_of(path)
-    if head is None:
+    if head is None or any(column.startswith("own_P") for column in head.names):
         return None
-    names = head.names
-    if any(name.startswith("own_P") for name in names):
+    axes = r.state or POSE
+    covariance = covariance_columns(head.names, axes)
+    if not covariance.places:
         return None
-    runs, of, value = (names.index(key) if key in names else None for key in ("run", "filter", by))
-    if run is not None:
-        runs = None
-    bare = TextFile(path, {}, True, run=run or 0, run_column=runs, filter_column=of, filter=name, by_column=value)
-    places = {name: i for i, name in enumerate(names)} | covariance_places(names, axes)
-    entries: dict[int, tuple[str, str]] = {}
-    for a, b in itertools.product(axes, repeat=2):
-        spelled = [f"P_{a}_{b}"]
-        if axes == POSE:
-            spelled += [OWN_NAMES.get((a, b), ""), LOWER_NAMES.get((a, b), "")]
-        entries |= {places[name]: (a, b) for name in spelled if name in places}
-    if entries:
-        return replace(bare, entries=entries)
-    for spelling in (*DEVIATIONS, "sigma_{}"):
-        if all(spelling.format(a) in places for a in axes):
-            entries = {places[spelling.format(a)]: (a, a) for a in axes}
-            return replace(bare, entries=entries, squared=False)
-    return None
+    components = {place: (axes[i], axes[j]) for (i, j), place in covariance.places.items()}
+    places = {column: place for place, column in enumerate(head.names)}
+    run_column = by_column = None
+    if run is None:
+        run_column = places.get("run")
+    if r.by is not None and r.by_file is None:
+        by_column = places.get(r.by)
+    return TextFile(path, components, covariance.squared, run or 0, run_column, places.get("filter"), name, by_column)
 
 
 def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:
     """A trajectory with covariances in its lines."""
     head = head_of(path)
-    roles = None if head is None else roles_of(head.names, path)
-    if head is not None and roles is not None and not (head.comment and roles.is_tum):
-        deviations = len(roles.covariance) in SIZES and not roles.squared
-        return _of_numbers(path, roles.covariance, run, r, not deviations)
-    width = _width(path)
-    if width not in (DEVIATED, POSE_COLUMNS + FULL, POSE_COLUMNS + TRIANGLE):
-        return None
-    return _of_numbers(path, range(POSE_COLUMNS, width), run, r, width != DEVIATED)
+    found = None if head is None else pose_columns(head.names, path)
+    if head is None or found is None or (head.comment and found.is_tum):
+        return _numbers(path, POSE_NUMBERS, run, r)
+    squared = found.squared or len(found.covariance) not in DEVIATIONS
+    return _of_columns(path, found.covariance, run, r, squared)
 
 
-def _covariances(path: Path, run: int, r: Reading) -> TextFile | None:
-    """A file of lines of t and a covariance."""
-    width = _width(path)
-    return _of_numbers(path, range(1, width), run, r, True) if width in (1 + FULL, 1 + TRIANGLE) else None
-
-
-def _width(path: Path) -> int:
-    """Numbers in the first row of a file."""
+def _numbers(path: Path, first: int, run: int, r: Reading) -> TextFile | None:
+    """A file of numbers without names, whose covariances begin in column ``first``."""
+    width = 0
     with opened(path) as file:
         for raw in file:
             line = raw.decode("utf-8-sig").strip()
             if line and not line.startswith("#"):
-                return len(fields_of(line))
-    return 0
+                width = len(fields_of(line))
+                break
+    many = width - first
+    if many not in (6, TRIANGLE, FULL):
+        return None
+    return _of_columns(path, range(first, width), run, r, many != 6)
 
 
-def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, squared: bool) -> TextFile | None:
+def _of_columns(path: Path, columns: Sequence[int], run: int, r: Reading, squared: bool) -> TextFile | None:
     """A file with n^2 numbers of a covariance in a row, its upper triangle, or n of a diagonal, n = 6, 9 or 15."""
     many = len(columns)
     n = components_in(many)
@@ -194,9 +186,9 @@ def _of_numbers(path: Path, columns: Sequence[int], run: int, r: Reading, square
         return None
     order = covariance_order(n, r.covariance_order or ORDERS[0])
     names = [STATE[order.index(place)] for place in range(n)]
-    pairs = [(a, a) for a in names]
+    pairs = list(itertools.combinations_with_replacement(names, 2))
     if many == n * n:
-        pairs = [(a, b) for a in names for b in names]
-    elif many > n:
-        pairs = list(itertools.combinations_with_replacement(names, 2))
+        pairs = list(itertools.product(names, names))
+    elif many == n:
+        pairs = list(zip(names, names, strict=True))
     return TextFile(path, dict(zip(columns, pairs, strict=True)), squared, run)

@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.pose_covariances import require_spatial
 from consistency.referee.readers.formats.pose_rows import FULL, POSE
 from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.text_blocks import Lines
-from consistency.referee.readers.formats.tum import SpaceRun, poses_of, space_estimator
+from consistency.referee.readers.formats.tum import SpaceRun, poses_without_covariances, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
 from consistency.referee.readers.windows import MARGINAL
@@ -61,7 +61,7 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     if not is_one_bag(path):
         bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
-        return [poses_of(path, [_bare_run(bag, r) for bag in bags], r)]
+        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in bags], r)]
     if r.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
     require_spatial(r.error, SPATIAL)
@@ -136,9 +136,12 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
     InputError
         None is stated.
     """
-    variances = np.concatenate([np.diagonal(one.covariance, axis1=1, axis2=2) for one in poses])
-    none = (variances == 0).all(axis=0) | (variances >= ENDLESS).all(axis=0) | np.isnan(variances).all(axis=0)
-    none |= np.repeat((variances[:, ::3] == -1).all(axis=0), 3)
+    variances = np.concatenate([one.variances for one in poses])
+    none = np.isnan(variances).all(axis=0)
+    none |= (variances == 0).all(axis=0)
+    none |= (variances >= ENDLESS).all(axis=0)
+    of_blocks = (variances[:, ::3] == -1).all(axis=0)
+    none |= np.repeat(of_blocks, 3)
     values = f"0, -1 or {ENDLESS:g} in every message"
     if none.all():
         raise InputError(f"{path}: states no covariance: its variances are {values}")
@@ -243,7 +246,10 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
         raise InputError(f"{bag}: --truth-topic {topic}: is not there with poses; there are: {_listed(there, reader)}")
     if topic in _topics(reader, FIX):
         return _fixes(bag, topic, list(_messages(reader, topic)))
-    rows = (_row(each.header, getattr(each, "pose", None) or each.transform) for each in _messages(reader, topic))
+    rows = []
+    for each in _messages(reader, topic):
+        content = getattr(each, "pose", None) or each.transform
+        rows.append(_row(each.header, content))
     return _track(bag, topic, rows)
 
 
@@ -288,12 +294,14 @@ def _track(bag: Path, topic: str, rows: Iterable[Array]) -> Lines:
 def _row(header: Any, content: Any) -> Array:
     """Stamp, s, pose and covariance of a message, (44,); NaN without a covariance."""
     covariance = getattr(content, "covariance", None)
-    pose = content if covariance is None else content.pose
     if covariance is None:
         covariance = np.full(FULL, np.nan)
-    p = getattr(pose, "position", None) or pose.translation
-    q = getattr(pose, "orientation", None) or pose.rotation
-    return np.array([_stamp(header), p.x, p.y, p.z, q.x, q.y, q.z, q.w, *covariance], float)
+    else:
+        content = content.pose
+    p = getattr(content, "position", None) or content.translation
+    q = getattr(content, "orientation", None) or content.rotation
+    pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+    return np.array([_stamp(header), *pose, *covariance], float)
 
 
 def _stamp(header: Any) -> float:
@@ -333,9 +341,11 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
     T = np.eye(4)
     for link, forward in chain:
         own = tracks[link]
-        step = matrices(truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth)
+        poses = truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth
+        step = matrices(poses)
         T = T @ (step if forward else inverse(step))
-    values = np.column_stack([t, vectors(T), np.full((len(t), FULL), np.nan)])
+    unstated = np.full((len(t), FULL), np.nan)
+    values = np.column_stack([t, vectors(T), unstated])
     return replace(longest, values=values, line=longest.line[together], unit=f"message of {frames}")
 
 

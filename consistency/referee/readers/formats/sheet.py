@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,17 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import require
-from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, one_line, reading, require_name
-from consistency.referee.readers.formats.column_renaming import Columns, renamed
-from consistency.referee.readers.formats.text_blocks import FileRows, LineParser, bounded, floats, parsed
+from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, keys_once, one_line, reading, require_name
+from consistency.referee.readers.formats.file_head import Head
+from consistency.referee.readers.formats.spellings import Columns, renamed
+from consistency.referee.readers.formats.text_blocks import (
+    FileRows,
+    LineParser,
+    bounded,
+    floats,
+    parsed,
+    read_rows,
+)
 from consistency.referee.readers.places import listed, refuse
 from consistency.referee.types import Array, Indices
 
@@ -26,7 +35,9 @@ EMPTY = frozenset((  # what pandas and R write for no value
     "", "#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "-NaN", "-nan", "1.#IND", "1.#QNAN", "<NA>", "N/A", "NA",
     "NULL", "NaN", "None", "n/a", "nan", "null",
 ))  # fmt: skip
+OF_ONE_RUN = "write such poses to a file for each run and estimator"  # of a file with these columns
 NIS_DOF = "it is the number of measurements in each nis"  # of a column that is missing
+DOF_NEEDED = "a whole number from 0 to below 2^31"
 TRUTHS = {"True": True, "true": True, "TRUE": True, "False": False, "false": False, "FALSE": False}
 
 
@@ -91,7 +102,8 @@ class TableRows(FileRows):
 
     def rows(self, keep: Array) -> TableRows:
         """Some of the rows."""
-        return replace(self, data={name: cells[keep] for name, cells in self.data.items()}, line=self.line[keep])
+        data = {name: cells[keep] for name, cells in self.data.items()}
+        return replace(self, data=data, line=self.line[keep])
 
     def renamed(self, columns: Columns | None) -> TableRows:
         """The table with names of ``columns`` in place of its own."""
@@ -113,6 +125,21 @@ def are_dof(values: Array) -> Array:
     return np.asarray((values >= 0) & (values < MOST_DOF) & (values == np.round(values)))
 
 
+def checked_dof(nis: Array, dof: Array, place: Callable[[int], str]) -> Array:
+    """Degrees of freedom (N,), 0 where neither they nor a NIS is given.
+
+    Raises
+    ------
+    InputError
+        A NIS is negative or infinite, or its degrees of freedom are not a whole number of 0 or more.
+    """
+    dof = np.where(np.isnan(nis) & np.isnan(dof), 0.0, dof)
+    bad = (nis < 0) | np.isinf(nis) | ~are_dof(dof)
+    needed = f"nis must be 0 or more and finite, nis_dof {DOF_NEEDED}"
+    refuse(bad, place, lambda row: f"nis {nis[row]:g} with nis_dof {dof[row]:g}; {needed}")
+    return dof
+
+
 # --- tables ------------------------------------------------------------------------------------------
 
 
@@ -128,10 +155,7 @@ def read_sheet(path: Path, columns: Columns | None = None) -> TableRows:
         data, rows = read_columns(path, "cannot be read as Parquet")
         sheet = TableRows(path, data, np.arange(rows), "row")
     elif suffix in (".jsonl", ".ndjson"):
-        from consistency.referee.readers.formats.json_lines import read_json_lines
-
-        data, found = read_json_lines(path)
-        sheet = TableRows(path, data, found.line, "line", found.open_line, found.cut)
+        sheet = _read_json_lines(path)
     else:
         sheet = _read_csv(path)
     if not len(sheet):
@@ -142,6 +166,18 @@ def read_sheet(path: Path, columns: Columns | None = None) -> TableRows:
         for name in dict.fromkeys(sheet.texts("filter")):
             require_name(name, f"{path}: column 'filter'")
     return sheet
+
+
+def sheet_of(path: Path, head: Head, columns: Columns | None = None) -> TableRows:
+    """A text file under the names of its ``head``, which may stand in a comment or be apart by white space."""
+    if not (head.comment or head.spaced):
+        return read_sheet(path, columns)
+    header = 0 if head.comment else head.line
+    lines = read_rows(path, [len(head.names)], f"{len(head.names)} columns as named", header)
+    data: dict[str, Column] = {}
+    for name, values in zip(head.names, lines.values.T, strict=True):
+        data.setdefault(name, values)
+    return TableRows(path, data, lines.line, "line", lines.open_line, lines.cut)
 
 
 def frame_rows(frame: Any, name: str) -> TableRows:
@@ -155,7 +191,9 @@ def frame_rows(frame: Any, name: str) -> TableRows:
     require_distinct(list(map(str, frame.columns)), name)
     data = {}
     for column in frame.columns:
-        data[str(column)] = _cells(np.asarray(frame[column]))
+        values = np.asarray(frame[column])
+        is_number = values.dtype.kind in "fiu"
+        data[str(column)] = np.asarray(values, float) if is_number else _cells(values.tolist())
     rows = len(next(iter(data.values()), ()))
     if not rows:
         raise InputError(f"{name}: holds no row")
@@ -169,12 +207,12 @@ def require_distinct(names: Sequence[str], where: Path | str) -> None:
         raise InputError(f"{where}: column '{twice[0]}' is duplicated")
 
 
-def _cells(values: Array) -> Column:
-    """A column in memory: floats, or objects with None where a cell is empty."""
-    if values.dtype.kind in "fiu":
-        return np.asarray(values, float)
-    filled = [None if str(cell) in EMPTY else cell for cell in values.tolist()]
-    return np.array(filled, object)
+def _cells(values: Sequence[Any]) -> Column:
+    """Cells as floats where all are numbers or empty, or as objects with None where one is empty."""
+    if set(map(type, values)) <= {int, float, type(None)}:
+        return np.array([np.nan if cell is None else min(max(cell, -1e308), 1e308) for cell in values], float)
+    filled = [None if str(cell) in EMPTY else cell for cell in values]
+    return np.array([*filled, None], object)[:-1]
 
 
 def _read_csv(path: Path) -> TableRows:
@@ -286,5 +324,55 @@ def _joined(parts: list[Column]) -> Column:
         return np.concatenate(parts)
     as_objects = []
     for part in parts:
-        as_objects.append(part if part.dtype.kind == "O" else np.where(np.isnan(part), np.array(None), part))
+        if part.dtype.kind != "O":
+            part = np.where(np.isnan(part), np.array(None), part)
+        as_objects.append(part)
     return np.concatenate(as_objects)
+
+
+# --- JSON lines --------------------------------------------------------------------------------------
+
+GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; solve the receiver's raw data with RTKLIB"
+
+
+class _Objects(LineParser):
+    def row(self, number: int, line: str) -> dict[str, Any]:
+        return _object(self.path, number, line)
+
+    def is_whole(self, line: str, above: object) -> bool:
+        return line.rstrip().endswith("}")
+
+
+def _read_json_lines(path: Path) -> TableRows:
+    """An object a line, as loggers write them: columns are the keys, inner ones after a dot (``P.0.1``).
+
+    Cells are None or NaN where a line lacks a key.
+    """
+    found = parsed(_Objects(path))
+    rows = list(itertools.chain.from_iterable(found.parts))
+    columns = {}
+    for name in dict.fromkeys(itertools.chain.from_iterable(rows)):
+        columns[name] = _cells([row.get(name) for row in rows])
+    return TableRows(path, columns, found.line, "line", found.open_line, found.cut)
+
+
+def _object(path: Path, number: int, line: str) -> dict[str, Any]:
+    with reading(path, f"line {number} is not valid JSON"):
+        value = json.loads(line, object_pairs_hook=keys_once)
+        cells = list(_keys("", value))
+    row = dict(cells)
+    if not isinstance(value, dict) or len(row) < len(cells):
+        raise InputError(f"{path}, line {number}: must be an object, and no key a.b beside b within a")
+    if row.get("class") in ("TPV", "SKY", "GST"):
+        raise InputError(f"{path}, line {number}: {GPSD}")
+    return row
+
+
+def _keys(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
+        yield name, value
+        return
+    for key, each in value.items():
+        yield from _keys(f"{name}.{key}".lstrip("."), each)

@@ -8,26 +8,29 @@ from pathlib import Path
 
 import numpy as np
 
+from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns
-from consistency.referee.readers.formats.column_renaming import Columns
+from consistency.referee.readers.formats.columns import covariance_columns, is_pose
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
-from consistency.referee.readers.formats.named_columns import naming
-from consistency.referee.readers.formats.other_names import (
-    missing_truth,
-    true_columns,
-    with_clock,
-    with_known_names,
-)
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.table_columns import POSE
+from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
-from consistency.referee.readers.places import Places, listed
-from consistency.referee.readers.truth_matching import ALONE, WHOLE, Estimator, Poses, Stated, manifold_of, unstated
+from consistency.referee.readers.places import listed
+from consistency.referee.readers.truth_matching import (
+    ALONE,
+    WHOLE,
+    Estimator,
+    Poses,
+    Stated,
+    finite_rows,
+    manifold_of,
+    unstated,
+)
 from consistency.referee.types import Array
 
 
@@ -56,12 +59,13 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
         of_filters = {name: sheet.rows(filters == name) for name in dict.fromkeys(filters)}
     found = []
     for name, own in of_filters.items():
-        true = truth if r.truth is not None else true_columns(own, axes)
+        true = truth if r.truth is not None else columns.true_columns(own, axes)
         if true is None:
             found.append(_innovations(name, own, key, axes))
         else:
             found.append(_estimator(name, own, true, key, axes, convention, r, poses_alone))
-    return [replace(found[0], notes=(*notes, *found[0].notes)), *found[1:]]
+    first = found[0]
+    return [replace(first, notes=(*notes, *first.notes)), *found[1:]]
 
 
 def _both(
@@ -76,12 +80,12 @@ def _both(
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     by_step = "step" in sheet and (truth is None or "step" in truth)
     if not by_step or r.time_offset is not None or r.max_dt is not None:
-        sheet = with_clock(sheet)
+        sheet = columns.with_clock(sheet)
         if truth is not None:
-            truth = with_clock(truth)
+            truth = columns.with_clock(truth)
     if truth is None:
-        truth = true_columns(sheet, axes)
-        missing = missing_truth(sheet, axes)
+        truth = columns.true_columns(sheet, axes)
+        missing = columns.missing_truth(sheet, axes)
         if truth is not None:
             notes.append(f"{sheet.path}: the truth stands in columns beside the estimates")
         elif missing:
@@ -104,11 +108,11 @@ def _sheet(
         from consistency.referee.readers.formats.kitti_files import drive_sheet
 
         sheet = drive_sheet(table, body)
-    elif axes == POSE:
+    elif is_pose(axes):
         sheet, note = planar_sheet(table, motions, renaming)
     else:
         sheet = read_sheet(table, renaming)
-    sheet, taken = with_known_names(sheet, axes)
+    sheet, taken = columns.with_known_names(sheet, axes)
     return sheet, "; ".join(filter(None, (note, taken)))
 
 
@@ -133,7 +137,7 @@ def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = N
 def _convention(convention: str | None, axes: tuple[str, ...], truth: TableRows | None) -> str:
     if convention is not None and truth is None:
         raise InputError("--error needs --truth: without truth there is no error")
-    if axes == POSE:
+    if is_pose(axes):
         if convention not in (None, *PLANAR):
             raise InputError(f"--error {convention}: for x, y, heading it is one of {', '.join(PLANAR)}")
         return convention or "so2"
@@ -148,7 +152,7 @@ def _require_truth(
     """Refuse options that need a truth, or poses, where there are none."""
     if r.relative is not None and truth is None:
         raise InputError(f"{sheet.path}: --relative needs --truth FILE, poses in any world")
-    if r.relative is not None and (axes != POSE or convention == "vector"):
+    if r.relative is not None and (not is_pose(axes) or convention == "vector"):
         raise InputError(f"{sheet.path}: --relative needs poses x, y, heading, with --error so2, left or right")
     if r.align is not None and convention == "vector":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
@@ -157,7 +161,7 @@ def _require_truth(
         state = ""
         if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
-        missing = missing_truth(sheet, axes)
+        missing = columns.missing_truth(sheet, axes)
         if missing:
             raise InputError(f"{sheet.path}: {missing}")
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
@@ -197,10 +201,23 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
     t = sheet.numbers(key, finite=True)
     state = np.column_stack([nothing, *map(sheet.numbers, sheet.among(axes))])
     nis, dof = columns.nis_columns(sheet)
+    covariance, stated = unstated(len(sheet), 1)
     poses = Poses(
-        Places(sheet.place, np.arange(len(sheet))), t, state, *unstated(len(sheet), 1), t, nothing, "vector", "vector",
-        0.0, numbered=key == "step", clock=_clock(sheet), nis=nis, nis_dof=dof,
-    )  # fmt: skip
+        place=sheet.places,
+        t=t,
+        estimate=state,
+        covariance=covariance,
+        stated=stated,
+        true_t=t,
+        truth=nothing,
+        manifold="vector",
+        convention="vector",
+        max_dt=0.0,
+        numbered=key == "step",
+        clock=_clock(sheet),
+        nis=nis,
+        nis_dof=dof,
+    )
     return Estimator(name, sheet.path, _by_run(sheet, runs, poses), axes, innovations_alone=True)
 
 
@@ -228,19 +245,34 @@ def _estimator(
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])
     if r.relative is not None and not r.motions:
-        cross = columns.cross_covariances(sheet)
+        cross = columns.stated_cross_covariances(sheet)
     if r.truth_covariance is not None:
-        of_truth = columns.stated_covariance(truth, axes)
+        of_truth = columns.stated_covariance(truth, axes, covariance_columns(list(truth.data), axes))
     estimate = sheet.matrix(axes)
-    estimate[~np.isfinite(estimate).all(axis=1)] = np.nan
+    estimate[~finite_rows(estimate)] = np.nan
     nis, dof = columns.nis_columns(sheet)
     by_step = key == "step"
     poses = Poses(
-        Places(sheet.place, np.arange(len(sheet))), sheet.numbers(key, finite=True), estimate, covariance, known,
-        truth.numbers(key), truth.matrix(axes, finite=True), manifold_of(convention), convention,
-        0.0 if by_step else r.tolerance, cross, of_truth, files=(sheet.path, truth.path), numbered=by_step,
-        clock=_clock(sheet), true_clock=_clock(truth), nis=nis, nis_dof=dof, by=columns.own_column(sheet, r),
-    )  # fmt: skip
+        place=sheet.places,
+        t=sheet.numbers(key, finite=True),
+        estimate=estimate,
+        covariance=covariance,
+        stated=known,
+        true_t=truth.numbers(key),
+        truth=truth.matrix(axes, finite=True),
+        manifold=manifold_of(convention),
+        convention=convention,
+        max_dt=0.0 if by_step else r.tolerance,
+        cross=cross,
+        true_covariance=of_truth,
+        files=(sheet.path, truth.path),
+        numbered=by_step,
+        clock=_clock(sheet),
+        true_clock=_clock(truth),
+        nis=nis,
+        nis_dof=dof,
+        by=columns.own_column(sheet, r),
+    )
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
         of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
@@ -263,7 +295,8 @@ def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
         if "run" in sheet:
             name = f"run {run}"
         one = poses.of_rows(rows)
-        found.append(replace(one, run=int(run), name=name, open_end=sheet.open_end(int(rows[-1]))))
+        open_end = sheet.open_end(int(rows[-1]))
+        found.append(replace(one, run=int(run), name=name, open_end=open_end))
     return found
 
 
@@ -280,14 +313,16 @@ def _position(axes: Sequence[str]) -> int:
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:
     """Covariances (N, n, n), which of them are stated, and a note on them."""
-    if convention != ADDITIVE and axes == POSE and columns.has_own(sheet):
-        note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
-        return columns.stated_covariance(sheet, axes, own=True), WHOLE, note
-    deviations = columns.stated_deviations(sheet, axes)
-    if deviations is None:
-        return columns.stated_covariance(sheet, axes), WHOLE, ""
+    if convention != ADDITIVE and is_pose(axes):
+        own = columns.own_covariance(sheet)
+        if own is not None:
+            note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
+            return own, WHOLE, note
+    entries = covariance_columns(list(sheet.data), axes)
+    if not entries.without_cross_terms(len(axes)):
+        return columns.stated_covariance(sheet, axes, entries), WHOLE, ""
     note = f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
-    return diagonal(deviations), ALONE, note
+    return diagonal(columns.stated_deviations(sheet, entries)), ALONE, note
 
 
 def _absent(name: str, truth: TableRows, runs: Array, true_runs: Array) -> list[str]:

@@ -1,23 +1,142 @@
-"""Columns of a table as arrays: order of its rows, covariances, deviations, innovations."""
+"""Columns of a table by their meaning: under the names of docs/files.md, in order, and as arrays."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE
+from consistency.referee.column_names import OWN_COVARIANCE, POSE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.named_columns import DEVIATIONS, naming, spelled
-from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, are_dof
+from consistency.referee.readers.clock_units import unit_of
+from consistency.referee.readers.formats.columns import Entries, covariance_columns, entry_name, is_pose, state_columns
+from consistency.referee.readers.formats.file_head import fields_of
+from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, checked_dof
+from consistency.referee.readers.formats.spellings import OWN, TRUE, Clock, clock_of, naming, require_units
+from consistency.referee.readers.formats.text_blocks import FileRows, blocks
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.places import exact, refuse
+from consistency.referee.readers.places import exact
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
 
-POSE = ("x", "y", "heading")
-OWN_NAMES = {(POSE[i], POSE[j]): name for name, (i, j) in COVARIANCE.items()}
-LOWER_NAMES = {pair: f"P_{name[3]}{name[2]}" for pair, name in OWN_NAMES.items()}
+KEYS = ("run", "step", "t")
+
+# --- names -------------------------------------------------------------------------------------------
+
+
+def with_known_names(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, str]:
+    """The table with its state under the names of docs/files.md, and a note on columns that have other names."""
+    names = list(sheet.data)
+    entries = covariance_columns(names, axes)
+    data = dict(sheet.data)
+    read_as = {}
+    for axis, place in state_columns(names, axes, OWN).items():
+        if names[place] != axis:
+            data[axis] = sheet.data[names[place]]
+            read_as[axis] = names[place]
+    if entries.renamed:
+        for (i, j), place in entries.places.items():
+            known = f"sigma_{axes[i]}"
+            if entries.squared:
+                known = f"P_{axes[i]}_{axes[j]}"
+            read_as[known] = names[place]
+    require_units(read_as.values(), sheet.path)
+    note = ""
+    if read_as:
+        taken = ", ".join(f"{name} as {known}" for known, name in read_as.items())
+        note = f"{sheet.path}: read {taken}"
+    return replace(sheet, data=data), note
+
+
+def true_columns(sheet: TableRows, axes: Sequence[str]) -> TableRows | None:
+    """The truth that stands beside the estimates, as ``true_x`` beside ``x``, in rows that have one; None without."""
+    names = list(sheet.data)
+    places = state_columns(names, axes, TRUE)
+    if set(places) != set(axes):
+        return None
+    columns = [names[places[axis]] for axis in axes]
+    require_units(columns, sheet.path)
+    values = sheet.matrix(columns)
+    data = dict(zip(axes, values.T, strict=True))
+    for key in sheet.among(KEYS):
+        data[key] = sheet.data[key]
+    complete = np.asarray(~np.isnan(values).any(axis=1))
+    return replace(sheet, data=data).rows(complete)
+
+
+def missing_truth(sheet: TableRows, axes: Sequence[str]) -> str:
+    """What a table lacks in which the truth of only some components stands beside the estimates; "" of others."""
+    places = state_columns(list(sheet.data), axes, TRUE)
+    missing = [axis for axis in axes if axis not in places]
+    if not places or not missing:
+        return ""
+    return (
+        f"column 'true_{missing[0]}' is missing; there are: {sheet.columns}; the state is {','.join(axes)}: --state "
+        f"names another, and --columns true_{missing[0]}=NAME that column"
+    )
+
+
+def require_columns(sheet: TableRows, axes: Sequence[str]) -> None:
+    """Refuse a table that lacks a column of the state."""
+    for axis in axes:
+        if axis in sheet:
+            continue
+        hint = ""
+        if is_pose(axes):
+            hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
+        what = f"column '{axis}' is missing; there are: {sheet.columns}"
+        raise InputError(f"{sheet.path}: {what}; {naming(axis)}{hint}")
+
+
+# --- times and order ---------------------------------------------------------------------------------
+
+
+def with_clock(sheet: TableRows, required: bool = True) -> TableRows:
+    """The table with a column ``t``, s, of a time by another name; itself where it has none, or ``t``.
+
+    Text in the place of a time is refused if it is ``required``, and not looked at otherwise.
+    """
+    if "t" in sheet:
+        return sheet
+    names = list(sheet.data)
+    clock = clock_of([name or "index" for name in names])
+    if clock is None:
+        return sheet
+    columns = [names[place] for place in clock.places]
+    if not required and any(sheet.data[name].dtype.kind != "f" for name in columns):
+        return sheet
+    t, _ = times_of(sheet, clock, list(map(sheet.numbers, columns)))
+    return replace(sheet, data=sheet.data | {"t": t})
+
+
+def times_of(rows: FileRows, clock: Clock, columns: Sequence[Array]) -> tuple[Array, int]:
+    """Times in s, each the number nearest to what the file says, and how many of its units are a second.
+
+    A double does not hold the nanoseconds since 1970, so that they are read again from a text, as whole numbers.
+    """
+    unit = 10**9
+    rough = columns[0] + columns[-1] / unit
+    if len(columns) == 1:
+        unit = unit_of(columns[0], clock.unit)
+        rough = columns[0] / unit
+    if unit < 10**9 or rows.unit != "line" or (np.diff(rows.line) <= 0).any():
+        return rough, unit
+    wanted = iter(rows.line.tolist())
+    row = next(wanted, None)
+    t = []
+    try:
+        for block in blocks(rows.path):
+            for number, line in block.lines():
+                if number == row:
+                    cells = fields_of(line)
+                    *seconds, nanoseconds = (int(cells[place]) for place in clock.places)
+                    t.append((sum(seconds) * unit + nanoseconds) / unit)
+                    row = next(wanted, None)
+    except (ValueError, IndexError, OverflowError):
+        return rough, unit
+    return np.array(t), unit
 
 
 def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
@@ -34,11 +153,13 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     order = np.lexsort((values, runs))
     if key == "t":
         order = np.argsort(runs, kind="stable")
-    stuck = np.flatnonzero((np.diff(runs[order]) == 0) & (np.diff(values[order]) <= 0))
+    is_stuck = (np.diff(runs[order]) == 0) & (np.diff(values[order]) <= 0)
+    stuck = np.flatnonzero(is_stuck)
     if not len(stuck):
         return order
     before, row = order[stuck[0] : stuck[0] + 2]
-    of, hint = "", "; several runs need a column 'run'"
+    of = ""
+    hint = "; several runs need a column 'run'"
     if "run" in sheet:
         of = f" of run {runs[row]}"
         hint = ""
@@ -59,7 +180,47 @@ def by_run(sheet: TableRows, key: str) -> tuple[TableRows, Array]:
     return sheet.rows(order), runs[order]
 
 
-def cross_covariances(sheet: TableRows) -> Array | None:
+# --- covariances and innovations ------------------------------------------------------------------------
+
+
+def stated_covariance(sheet: TableRows, axes: Sequence[str], entries: Entries) -> Array:
+    """(N, n, n) from the upper triangle; a lower triangle beside it must agree."""
+    require_columns(sheet, axes)
+    names = list(sheet.data)
+    n = len(axes)
+    out = np.empty((len(sheet), n, n))
+    for i, j in itertools.combinations_with_replacement(range(n), 2):
+        there = [entries.places[pair] for pair in ((i, j), (j, i)) if pair in entries.places]
+        if not there:
+            missing = entry_name(axes, i, j)
+            what = f"column '{missing}' is missing; the covariance of {', '.join(axes)} needs its upper triangle"
+            advice = f"{naming(missing)}; --state a,b judges fewer components"
+            raise InputError(f"{sheet.path}: {what}, zeros included; {advice}")
+        out[:, i, j] = sheet.numbers(names[there[0]])
+        out[:, j, i] = sheet.numbers(names[there[-1]])
+    return symmetric(out, sheet.place)
+
+
+def stated_deviations(sheet: TableRows, entries: Entries) -> Array:
+    """Standard deviations (N, n) of a table without cross terms, of columns of these or of variances."""
+    names = list(sheet.data)
+    values = sheet.matrix(names[place] for place in entries.places.values())
+    if entries.squared:
+        values = np.sign(values) * np.sqrt(np.abs(values))
+    return np.asarray(values)
+
+
+def own_covariance(sheet: TableRows) -> Array | None:
+    """Covariances (N, 3, 3) of a filter's own error, of columns own_P_*; None without them."""
+    if not sheet.has(*OWN_COVARIANCE) or any(sheet.empty(name).all() for name in OWN_COVARIANCE):
+        return None
+    out = np.empty((len(sheet), 3, 3))
+    for name, (i, j) in OWN_COVARIANCE.items():
+        out[:, i, j] = out[:, j, i] = sheet.numbers(name)
+    return out
+
+
+def stated_cross_covariances(sheet: TableRows) -> Array | None:
     """Cross-covariances with the row before, columns C_xx, C_xy, C_xh, C_yx, ..., (N, 3, 3); None without any."""
     columns = []
     missing = []
@@ -75,74 +236,6 @@ def cross_covariances(sheet: TableRows) -> Array | None:
         what = f"column '{missing[0]}' is missing; a cross-covariance is not a symmetric matrix"
         raise InputError(f"{sheet.path}: {what}")
     return sheet.matrix(columns).reshape(-1, 3, 3)
-
-
-def has_own(sheet: TableRows) -> bool:
-    """Whether the rows are of a filter of the bench that states the covariance of an error of its own."""
-    return sheet.has(*OWN_COVARIANCE) and not any(sheet.empty(name).all() for name in OWN_COVARIANCE)
-
-
-def entry_names(a: str, b: str, short: bool) -> tuple[list[str], list[str]]:
-    """Names of the covariance of two components in the upper and in the lower triangle; ``short`` ones as P_xh too."""
-    upper = [f"P_{a}_{b}"]
-    lower = [f"P_{b}_{a}"]
-    if short and (a, b) in OWN_NAMES:
-        upper.append(OWN_NAMES[a, b])
-        lower.append(LOWER_NAMES[a, b])
-    return upper, lower
-
-
-def stated_deviations(sheet: TableRows, axes: tuple[str, ...]) -> Array | None:
-    """Standard deviations (N, n) of a table without cross terms: sigma_x, std_x, sx, or P_x_x alone; None of others."""
-    for a, b in itertools.combinations(axes, 2):
-        upper, lower = entry_names(a, b, short=True)
-        if sheet.among(upper + lower):
-            return None
-    variances = []
-    for axis in axes:
-        names, _ = entry_names(axis, axis, short=True)
-        variances += sheet.among(names)[:1]
-    if len(variances) == len(axes) > 1:
-        P = sheet.matrix(variances)
-        return np.asarray(np.sign(P) * np.sqrt(np.abs(P)))
-    for spelling in DEVIATIONS:
-        names = spelled(spelling, axes)
-        if sheet.has(*names) and not variances:
-            return sheet.matrix(names)
-    return None
-
-
-def stated_covariance(sheet: TableRows, axes: tuple[str, ...], own: bool = False) -> Array:
-    """(N, n, n) from the upper triangle; a lower triangle beside it must agree. ``own``: of the columns own_P_*."""
-    require_columns(sheet, axes)
-    n = len(axes)
-    out = np.empty((len(sheet), n, n))
-    if own:
-        for name, (i, j) in OWN_COVARIANCE.items():
-            out[:, i, j] = out[:, j, i] = sheet.numbers(name)
-        return out
-    for i, j in itertools.combinations_with_replacement(range(n), 2):
-        upper, lower = entry_names(axes[i], axes[j], short=axes == POSE)
-        there = sheet.among(upper + lower)
-        if not there:
-            what = f"column '{upper[-1]}' is missing; the covariance of {', '.join(axes)} needs its upper triangle"
-            advice = f"{naming(upper[-1])}; --state a,b judges fewer components"
-            raise InputError(f"{sheet.path}: {what}, zeros included; {advice}")
-        out[:, i, j] = sheet.numbers(there[0])
-        out[:, j, i] = sheet.numbers(there[-1])
-    return symmetric(out, sheet.place)
-
-
-def require_columns(sheet: TableRows, axes: tuple[str, ...]) -> None:
-    """Refuse a table that lacks a column of the state."""
-    for axis in axes:
-        if axis in sheet:
-            continue
-        hint = ""
-        if axes == POSE:
-            hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
-        what = f"column '{axis}' is missing; there are: {sheet.columns}"
-        raise InputError(f"{sheet.path}: {what}; {naming(axis)}{hint}")
 
 
 def own_column(sheet: TableRows, r: Reading) -> Array | None:
@@ -162,9 +255,5 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
     if "nis_dof" not in sheet:
         raise InputError(f"{sheet.path}: column 'nis_dof' is missing; {NIS_DOF}")
     nis = sheet.numbers("nis")
-    dof = sheet.numbers("nis_dof")
-    known = np.isfinite(nis)
-    bad = (nis < 0) | np.isinf(nis) | (known & ~are_dof(dof))
-    what = "nis {:g} with nis_dof {:g}; nis must be 0 or more, nis_dof a whole number from 0 to below 2^31".format
-    refuse(bad, sheet.place, lambda row: what(nis[row], dof[row]))
-    return nis, np.where(known, dof, 0.0)
+    dof = np.where(np.isnan(nis), 0.0, sheet.numbers("nis_dof"))
+    return nis, checked_dof(nis, dof, sheet.place)

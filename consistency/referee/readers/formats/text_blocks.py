@@ -14,7 +14,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, reading, require_room
-from consistency.referee.readers.places import cut_note, exact, refuse
+from consistency.referee.readers.places import Places, cut_note, exact, refuse
 from consistency.referee.types import Array, Indices
 
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
@@ -156,6 +156,11 @@ class FileRows:
     def place(self, row: int) -> str:
         return f"{self.path}, {self.unit} {self.line[row]}"
 
+    @property
+    def places(self) -> Places:
+        """Places of all rows."""
+        return Places(self.place, np.arange(len(self.line)))
+
     def open_end(self, row: int = -1) -> str:
         """What to note of a row if it is cut short; "" where its line has an end."""
         if not self.open_line or self.line[row] != self.open_line:
@@ -199,7 +204,8 @@ class Lines(FileRows):
         """The lines without the last one if it alone is ``bad``, (N,) of bool, and has no end."""
         if not self.open_line or len(bad) < 2 or not bad[-1] or bad[:-1].any():
             return self
-        return replace(self.rows(slice(-1)), open_line=0, cut=cut_note(self.path, self.open_line))
+        note = cut_note(self.path, self.open_line)
+        return replace(self.rows(slice(-1)), open_line=0, cut=note)
 
 
 def bounded(values: Array) -> Array:

@@ -13,8 +13,7 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import INERTIAL, PLANAR
 from consistency.referee.readers.formats import pose_covariances as stated_as
-from consistency.referee.readers.formats.column_renaming import Columns
-from consistency.referee.readers.formats.file_kinds import is_drive, table_files, trajectory_files
+from consistency.referee.readers.formats.file_kinds import files_of_runs, is_drive, paired
 from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.formats.pose_covariances import ORDERS
@@ -33,14 +32,15 @@ from consistency.referee.readers.formats.pose_rows import (
 from consistency.referee.readers.formats.position_truth import (
     fixed,
     placeholder,
+    point_positions,
     position_note,
-    positions,
     require_positions,
 )
 from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.spellings import Columns
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
-from consistency.referee.readers.places import Places, one_of_each_kind, refuse
+from consistency.referee.readers.places import one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
     ALONE,
@@ -50,8 +50,10 @@ from consistency.referee.readers.truth_matching import (
     STATE,
     WHOLE,
     Estimator,
+    Files,
     Poses,
     Stated,
+    finite_rows,
     unstated,
 )
 from consistency.referee.types import Array
@@ -65,7 +67,7 @@ class SpaceRun:
 
     own: Lines
     true: Lines
-    files: tuple[Path | str, Path | str]  # of the estimates, of the truth
+    files: Files  # of the estimates, of the truth
     covariance: Path | None = None  # where it is not in the lines
     notes: Sequence[str] = ()
 
@@ -86,8 +88,13 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     stated_as.require_spatial(r.error, INERTIAL)
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
-    runs = (SpaceRun(read_trajectory(own, columns=r.columns), truth_of(true), (own, true), P) for own, true, P in files)
-    return [poses_of(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
+    runs = (_run_of(own, true, P, truth_of, r) for own, true, P in files)
+    return [poses_without_covariances(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
+
+
+def _run_of(own: Path, true: Path, covariance: Path | None, truth_of: Callable[[Path], Lines], r: Reading) -> SpaceRun:
+    lines = read_trajectory(own, columns=r.columns)
+    return SpaceRun(lines, truth_of(true), (own, true), covariance)
 
 
 class Layout(NamedTuple):
@@ -95,7 +102,7 @@ class Layout(NamedTuple):
 
     stated: Stated
     convention: str  # of the error of poses; "" of positions by satellite
-    files: tuple[Path | str, Path | str]  # of the first run
+    files: Files  # of the first run
 
 
 def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str = "", mixed: str = "") -> Estimator:
@@ -111,7 +118,8 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     layout: Layout | None = None
     for run in runs:
         own, true, world = localised(run.own, run.true)
-        notes += [own.cut, true.cut, own.note, true.note, world, _unused(true, r), *run.notes]
+        notes += [own.cut, true.cut, own.note, true.note, world]
+        notes += [_unused(true, r), *run.notes]
         if layout is None:
             layout = _layout_of(own, run.files, r)
             notes.append(stated_as.order_note(run.files[0], stated_as.components_of(own), r))
@@ -127,7 +135,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         if what:
             notes.append(f"{layout.files[1]}: {what}")
         if is_empty:
-            poses = [positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
+            poses = [point_positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
         require_positions(path, poses, r)
     elif r.lever_arm is not None:
@@ -143,12 +151,22 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
     axes = STATE[: poses[0].covariance.shape[-1]]
     return Estimator(
-        path.stem, path, poses, axes, kind, definition, layout.stated, path.name, r.covariance,
-        one_of_each_kind(notes), in_space=True, position=3,
-    )  # fmt: skip
+        path.stem,
+        path,
+        poses,
+        axes,
+        kind,
+        definition,
+        layout.stated,
+        label=path.name,
+        covariances=r.covariance,
+        notes=one_of_each_kind(notes),
+        in_space=True,
+        position=3,
+    )
 
 
-def _layout_of(own: Lines, files: tuple[Path | str, Path | str], r: Reading) -> Layout:
+def _layout_of(own: Lines, files: Files, r: Reading) -> Layout:
     """The layout of the first run.
 
     Raises
@@ -189,7 +207,7 @@ def _origin(stated: Stated) -> str:
     return OPENVINS
 
 
-def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
+def poses_without_covariances(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
     """Poses in space without their covariances.
 
     Raises
@@ -198,20 +216,12 @@ def poses_of(path: Path, runs: Iterable[SpaceRun], r: Reading) -> Estimator:
         A file holds positions alone.
     """
     poses = []
-    pose = slice(1, POSE)
     for run in runs:
-        own = run.own
-        true = run.true
-        for lines, name in zip((own, true), run.files, strict=True):
+        for lines, name in zip((run.own, run.true), run.files, strict=True):
             if _is_point(lines):
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
-        place = Places(own.place, np.arange(len(own.t)))
-        poses.append(
-            Poses(
-                place, own.t, own.values[:, pose], *unstated(len(own.t), 6), true.t, true.values[:, pose], "spatial",
-                "left", r.tolerance, name=own.path.stem, files=run.files,
-            )
-        )  # fmt: skip
+        covariance, stated = unstated(len(run.own.t), 6)
+        poses.append(_poses(run, 0, covariance, stated, "left", r))
     return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
 
 
@@ -228,14 +238,32 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     order = r.covariance_order or ORDERS[0]
     P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
     of_truth = _of_truth(true, own, order, r)
-    own = own.of(slice(0, POSE))
-    poses = Poses(
-        Places(own.place, np.arange(len(own.t))), own.t, _states(own, k), P, known, true.t, _states(true, k), "spatial",
-        layout.convention, r.tolerance, cross, of_truth,
-    )  # fmt: skip
+    run = replace(run, own=own.of(slice(0, POSE)))  # without the covariances, of which P has a copy
+    poses = _poses(run, k, P, known, layout.convention, r)
+    poses = replace(poses, cross=cross, true_covariance=of_truth)
     if _is_point(true):
-        poses = positions(poses, r.lever_arm, layout.stated != WHOLE)
+        poses = point_positions(poses, r.lever_arm, layout.stated != WHOLE)
     return poses, note
+
+
+def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: str, r: Reading) -> Poses:
+    """Poses beside the true ones, both with the first ``k`` numbers of velocity and biases behind them."""
+    own = run.own
+    true = run.true
+    return Poses(
+        place=own.places,
+        t=own.t,
+        estimate=_states(own, k),
+        covariance=covariance,
+        stated=stated,
+        true_t=true.t,
+        truth=_states(true, k),
+        manifold="spatial",
+        convention=convention,
+        max_dt=r.tolerance,
+        name=own.path.stem,
+        files=run.files,
+    )
 
 
 def _covariances(
@@ -247,7 +275,8 @@ def _covariances(
     """
     P = stated_as.covariances_in(own, order)
     if path is None and P is not None:
-        return symmetric(P[:, :n, :n], own.place, one_triangle=True), np.ones(len(P), bool), None
+        covariance = symmetric(P[:, :n, :n], own.place, one_triangle=True)
+        return covariance, np.ones(len(P), bool), None
     if path is None:
         of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
         if isinstance(own, States):
@@ -266,7 +295,8 @@ def _covariances(
     cross = None
     if source.values.shape[1] == 1 + stated_as.BOTH:
         cross = stated_as.cross_covariances(own, source, rows, picked, order)
-    return stated_as.on_rows(len(known), rows, P[picked][:, :n, :n], source, picked), known, cross
+    covariance = stated_as.on_rows(len(known), rows, P[picked][:, :n, :n], source, picked)
+    return covariance, known, cross
 
 
 def _states(lines: Lines, k: int) -> Array:
@@ -306,9 +336,7 @@ def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
     if r.truth_covariance is None:
         return None
     if r.truth_covariance != COLUMNS:
-        path = Path(r.truth_covariance)
-        if path.is_dir():
-            path = _same_stem(path, own.path, "--truth-covariance")
+        path = paired(Path(r.truth_covariance), own.path, "--truth-covariance")
         return stated_as.from_file(truth, path, order, r.tolerance)
     P = truth.covariances if isinstance(truth, Fixes) else stated_as.covariances_in(truth, order)
     if P is None:
@@ -334,44 +362,6 @@ def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
     return read
 
 
-def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
-    """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
-    truth = r.truth
-    if not estimates.is_dir():
-        for option, path in (("--truth", truth), ("--covariance", covariance)):
-            if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
-                raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
-        return [(estimates, truth or estimates, covariance)]
-    files = trajectory_files(estimates, r.columns)
-    if not files:
-        raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
-    stems = [path.stem for path in files]
-    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
-        raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
-    if covariance is not None and not covariance.is_dir():
-        raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
-    out = []
-    for path in files:
-        own_truth = truth or path
-        own_covariance = covariance
-        if truth is not None and truth.is_dir() and not is_drive(truth):
-            own_truth = _same_stem(truth, path, "--truth")
-        if covariance is not None:
-            own_covariance = _same_stem(covariance, path, "--covariance")
-        out.append((path, own_truth, own_covariance))
-    return out
-
-
-def _same_stem(folder: Path, path: Path, option: str) -> Path:
-    if is_drive(folder / path.stem):
-        return folder / path.stem
-    for other in (*trajectory_files(folder), *table_files(folder)):
-        if other.stem == path.stem:
-            return other
-    what = f"holds no file '{path.stem}' with .txt or .tum, or table, for {path}"
-    raise InputError(f"{option} {folder}: {what}; files of the two folders are paired by name")
-
-
 def read_trajectory(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
     """A trajectory, checked: increasing timestamps, quaternions of unit length; NaN only in estimates."""
     return _checked(read_poses(path, true, columns), true)
@@ -381,7 +371,7 @@ def _checked(lines: Lines, true: bool = True) -> Lines:
     """Poses whose quaternions have unit length, and which are finite if they are a truth."""
     pose = lines.values[:, 1:POSE]
     if true:
-        refuse(~np.isfinite(pose).all(axis=1), lines.place, "the truth is not finite; leave such lines out")
+        refuse(~finite_rows(pose), lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):
         return lines
     bad, length = not_unit(pose)

@@ -23,7 +23,9 @@ APART = 2.0  # the same of a single component: one run that is off by a constant
 SAID = 0.2  # decades from which on the scale that remains is stated
 LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
 NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
-NEAR, SHARP, LEAST = 5.0, 0.5, 3  # sigmas, rad, steps: an error of an angle, but for whole turns
+NEAR = 5.0  # sigmas: an error of an angle, but for whole turns
+SHARP = 0.5  # rad
+LEAST = 3  # steps
 
 Pairs = Sequence[tuple[Array, Array]]
 ErrorsWithout = Callable[[Change], Pairs]
@@ -63,7 +65,8 @@ def hints(
     if not runs:
         return []
     part = list(range(len(axes)) if judged is None else judged)
-    some, worlds = runs, errors_without is None
+    some = runs
+    worlds = errors_without is None
     if errors_without is None:
         some = thinned(runs, shift)
         errors_without = partial(_errors_without, some)
@@ -142,9 +145,12 @@ def _candidates(
 
 def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
     """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
-    right, at_need = [], []
+    right = []
+    at_need = []
     for one in candidates:
-        if one.size * one.gain < bar or not one.fit.right(gross) or _status(one.fit) > _status(declared):
+        if one.size * one.gain < bar or not one.fit.right(gross):
+            continue
+        if _status(one.fit) > _status(declared):
             continue
         if one.guess.last:
             at_need.append(one)
@@ -160,10 +166,12 @@ def _status(fit: ReadingFit) -> int:
     from consistency.referee.diagnostics.judge_record import judge
     from consistency.referee.diagnostics.records.record import Record
 
-    nees = np.full((len(fit.whitened), max(map(len, fit.whitened))), np.nan)
+    longest = max(map(len, fit.whitened))
+    nees = np.full((len(fit.whitened), longest), np.nan)
     for row, w in zip(nees, fit.whitened, strict=True):
         row[: len(w)] = np.square(w).sum(axis=1)
-    return {"consistent": 0, "undecided": 1}.get(judge(Record("", nees=nees, dof=fit.n)).status, 2)
+    verdict = judge(Record("", nees=nees, dof=fit.n))
+    return {"consistent": 0, "undecided": 1}.get(verdict.status, 2)
 
 
 def _times(off: float) -> str:
@@ -179,7 +187,8 @@ def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remed
     for turn, by, sharp, how in ((2.0 * np.pi, "2 pi", SHARP, remedy), in_degrees):
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-            far = (np.abs(error) > 0.5 * turn) & (np.abs(error) > 2.0 * NEAR * sigma) & (NEAR * sigma < sharp)
+            far = np.abs(error) > np.maximum(0.5 * turn, 2.0 * NEAR * sigma)
+            far &= NEAR * sigma < sharp
             home = np.abs(error - turn * np.round(error / turn)) <= NEAR * sigma
         for k, axis in enumerate(axes):
             jumps = int(far[..., k].sum())

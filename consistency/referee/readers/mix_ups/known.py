@@ -14,16 +14,19 @@ from scipy.spatial.transform import Rotation
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import PLANAR, SPATIAL
 from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
-from consistency.referee.readers.truth_matching import Change, Poses, submatrices
+from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
-ALL_ORDERS, SWAPS = 4, 8  # components up to which all orders, and swaps of two, are looked at
+ALL_ORDERS = 4  # components up to which all orders are looked at
+SWAPS = 8  # and up to which swaps of two are
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
 SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
 UNIT = 1e-3  # lengths of quaternions differ by less from 1
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
+
+Function = Callable[[Any], Any]  # of a field of poses
 
 
 @dataclass(frozen=True)
@@ -40,32 +43,113 @@ class Guess:
 
 def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> list[Guess]:
     """Possible mix-ups of covariances, units and orders, the likelier first; ``part`` is judged."""
-    kind, convention = runs[0].manifold, runs[0].convention
+    kind = runs[0].manifold
+    convention = runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
         return list(_blocks(n))
     scales = [*_roots(part), *_singular(runs, axes, part)]
     if kind == "vector":
-        own = [*scales, *_permuted(axes, len(axes)), *_permuted(axes, len(axes), states=True)]
-        return [*own, *_quaternion_states(runs, axes)]
+        covariances = _permuted(axes, len(axes))
+        states = _permuted(axes, len(axes), states=True)
+        return [*scales, *covariances, *states, *_quaternion_states(runs, axes)]
     of_covariance = *scales, *_permuted(axes, 3)
     if kind == "spatial":
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
-        half = Guess(words, lambda p: _weighed(p, slice(3, 6), 2.0), exact=True)
-        own = [*_orders(convention), *_quaternions(), *of_covariance, *_units(3, slice(3, 6)), half, *_positions(3)]
+        angles = slice(3, 6)
+        half = Guess(words, changed(covariance=_times(angles, 2.0)), exact=True)
+        own = [*_orders(convention), *_quaternions(), *of_covariance]
+        own += [*_units(3, angles), half, *_positions(3)]
     else:
         sides = [kind for kind in PLANAR if kind not in (convention, "vector")]
-        own = [*map(_of_error, sides), *_headings(), *of_covariance, *_units(2, slice(2, 3)), *_positions(2)]
-    return [*own, Guess("the poses of the estimates are inverse, world in body; invert them", _inverse, fine=False)]
+        own = [*map(_of_error, sides), *_headings(), *of_covariance]
+        own += [*_units(2, slice(2, 3)), *_positions(2)]
+    words = "the poses of the estimates are inverse, world in body; invert them"
+    return [*own, Guess(words, changed(estimate=_inverse), fine=False)]
+
+
+# --- what makes fields of poses right ----------------------------------------------------------------
+
+
+def changed(**functions: Function) -> Change:
+    """A change of some fields of poses, each by a function of what it holds."""
+
+    def change(p: Poses) -> Poses:
+        return replace(p, **{name: function(getattr(p, name)) for name, function in functions.items()})
+
+    return change
+
+
+def _columns(order: Sequence[int]) -> Function:
+    """Columns (N, m) in another order."""
+    return lambda values: values[:, list(order)]
+
+
+def _components(order: Sequence[int]) -> Function:
+    """Rows and columns of matrices (N, n, n) in another order."""
+    return partial(submatrices, index=order)
+
+
+def _declared(convention: str) -> Function:
+    """Another convention of the error."""
+    return lambda _: convention
+
+
+def _times(part: slice, factor: float) -> Function:
+    """Matrices (N, n, n) with some components multiplied by a factor."""
+
+    def scaled(P: Array) -> Array:
+        scale = np.ones(P.shape[-1])
+        scale[part] = factor
+        return P * scale[:, None] * scale
+
+    return scaled
+
+
+def _inverse(poses: Array) -> Array:
+    """Inverse poses, where they are finite."""
+    finite = finite_rows(poses)
+    out = poses.copy()
+    out[finite] = vectors(inverse(matrices(poses[finite])))
+    return out
+
+
+# --- covariances -------------------------------------------------------------------------------------
 
 
 def _roots(part: list[int]) -> Iterator[Guess]:
     """Standard deviations, an inverse or a root in the place of the covariance."""
-    yield Guess("its diagonal holds standard deviations; square them", _covariance(_squared))
-    yield Guess("it is an information matrix; invert it", _covariance(partial(_inverted, part=part)))
+    yield Guess("its diagonal holds standard deviations; square them", changed(covariance=_squared))
+    inverted = partial(_inverted, part=part)
+    yield Guess("it is an information matrix; invert it", changed(covariance=inverted))
     words = "it holds the upper root U of an information matrix U'U; write the inverse of U'U"
-    yield Guess(words, _covariance(lambda P: _inverted(_of_root(P), part)))
-    yield Guess("it holds the lower root L of the covariance; write L L'", _covariance(_of_root))
+    yield Guess(words, changed(covariance=lambda U: inverted(_of_root(U))))
+    yield Guess("it holds the lower root L of the covariance; write L L'", changed(covariance=_of_root))
+
+
+def _squared(P: Array) -> Array:
+    return np.asarray(np.square(_without_cross_terms(P)))
+
+
+def _without_cross_terms(P: Array) -> Array:
+    variances = np.diagonal(P, axis1=1, axis2=2)
+    return np.asarray(variances[:, :, None] * np.eye(P.shape[-1]))
+
+
+def _of_root(P: Array) -> Array:
+    """U'U of the upper triangles U, which are the lower ones L turned over."""
+    U = np.triu(P)
+    return np.asarray(np.swapaxes(U, 1, 2) @ U)
+
+
+def _inverted(P: Array, part: list[int]) -> Array:
+    """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
+    out = np.full_like(P, np.nan)
+    block = submatrices(P, part)
+    finite = np.flatnonzero(finite_rows(block))
+    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
+    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
+    return out
 
 
 def _blocks(n: int) -> Iterator[Guess]:
@@ -78,58 +162,49 @@ def _blocks(n: int) -> Iterator[Guess]:
             if (np.diff(order) > 0).all():
                 continue
             text = ",".join(names[np.argsort(order)])
-            whole = (3 * order[:, None] + np.arange(3)).ravel().tolist()
+            components = 3 * order[:, None] + np.arange(3)
+            whole = components.ravel().tolist()
             words = f"the blocks of its covariance are in the order {text}; add --covariance-order {text}"
-            yield Guess(words, _reordered(None, whole))
+            yield Guess(words, changed(covariance=_components(whole)))
 
 
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
     P = submatrices(np.concatenate([p.covariance for p in runs]), part)
-    P = P[np.isfinite(P).all(axis=(1, 2))]
+    P = P[finite_rows(P)]
     if len(part) < 2 or not len(P):
         return
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
-        R = np.median(P / sigma[:, :, None] / sigma[:, None, :], axis=0)
+        correlations = P / sigma[:, :, None] / sigma[:, None, :]
+        R = np.median(correlations, axis=0)
     if not np.isfinite(R).all():
         return
     values, vectors = np.linalg.eigh(R)
     if values[0] > SINGULAR:
         return
-    v = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
+    v = vectors[:, 0]
+    v = v / v[np.argmax(np.abs(v))]
     direction = " ".join(f"{v[k]:+.2f} {axes[part[k]]}" for k in np.flatnonzero(np.abs(v) > 0.1))
     words = (
         f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations); "
         "look for lost digits or a correlation of 1"
     )
-    yield Guess(words, _covariance(lambda P: _diagonal(P) * np.eye(P.shape[-1])))
+    yield Guess(words, changed(covariance=_without_cross_terms))
 
 
-def _diagonal(P: Array) -> Array:
-    return np.diagonal(P, axis1=1, axis2=2)[:, :, None]
-
-
-def of_finite(p: Poses, function: Callable[[Array], Array]) -> Poses:
-    """The run with a function of those estimates that are finite."""
-    finite = np.isfinite(p.estimate).all(axis=1)
-    estimate = p.estimate.copy()
-    if finite.any():
-        estimate[finite] = function(estimate[finite])
-    return replace(p, estimate=estimate)
-
-
-def _inverse(p: Poses) -> Poses:
-    return of_finite(p, lambda own: vectors(inverse(matrices(own))))
+# --- orders ------------------------------------------------------------------------------------------
 
 
 def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
     """Four components of a state that are a unit quaternion, which has three degrees of freedom."""
     for first in range(len(axes) - 3):
         four = slice(first, first + 4)
-        values = np.concatenate([np.concatenate([p.estimate, p.truth])[:, four] for p in runs])
-        values = values[np.isfinite(values).all(axis=1)]
-        if not len(values) or (np.abs(np.linalg.norm(values, axis=1) - 1.0) > UNIT).any():
+        states = [values for p in runs for values in (p.estimate, p.truth)]
+        values = np.concatenate(states)[:, four]
+        values = values[finite_rows(values)]
+        lengths = np.linalg.norm(values, axis=1)
+        if not len(values) or (np.abs(lengths - 1.0) > UNIT).any():
             continue
         for w in (3, 0):
             order = {0: "w x y z", 3: "x y z w"}[w]
@@ -148,9 +223,14 @@ def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
         order = np.roll(order, -1)
     p = p.matched()
     turn = Rotation.from_quat(p.estimate[:, order])
-    small = (turn.inv() * Rotation.from_quat(p.truth[:, order])).as_rotvec()
+    true = Rotation.from_quat(p.truth[:, order])
+    small = (turn.inv() * true).as_rotvec()
     x, y, z, s = turn.as_quat().T
-    G = 2.0 * np.array([[s, z, -y, -x], [-z, s, x, -y], [y, -x, s, -z]])
+    G = 2.0 * np.array([
+        [s, z, -y, -x],
+        [-z, s, x, -y],
+        [y, -x, s, -z],
+    ])  # fmt: skip
     J = np.zeros((len(turn), len(rest) + 3, p.estimate.shape[1]))
     J[:, range(len(rest)), rest] = 1.0
     J[:, len(rest) :, order] = np.moveaxis(G, -1, 0)
@@ -169,17 +249,25 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
     for order, there in _other_orders(axes, width):
         words = what.format(f"in the order {there}{' (rotations alike)' * (n > width)}")
         whole = [*order, *(width + i for i in order)][:n]
-        yield Guess(f"{words}; write them as {', '.join(axes[:width])}", _reordered(whole if states else None, whole))
+        fields = {"covariance": _components(whole)}
+        if states:
+            fields["estimate"] = _columns(whole)
+        yield Guess(f"{words}; write them as {', '.join(axes[:width])}", changed(**fields))
 
 
 def _positions(width: int) -> Iterator[Guess]:
     """Coordinates of the estimates of poses in another order, with the blocks of their covariance or without."""
     axes = "xyz"[:width]
-    turned, rest = ([3, 4, 5, 6], [3, 4, 5]) if width == 3 else ([2], [2])
+    turned = rest = [2]
+    if width == 3:
+        turned = [3, 4, 5, 6]
+        rest = [3, 4, 5]
     for order, there in _other_orders(axes, width):
         words = f"of the estimates are in the order {there}; write them as {', '.join(axes)}"
-        yield Guess(f"the positions {words}", _reordered([*order, *turned]), fine=False)
-        yield Guess(f"positions and covariance {words}", _reordered([*order, *turned], [*order, *rest]), fine=False)
+        estimate = _columns([*order, *turned])
+        covariance = _components([*order, *rest])
+        yield Guess(f"the positions {words}", changed(estimate=estimate), fine=False)
+        yield Guess(f"positions and covariance {words}", changed(estimate=estimate, covariance=covariance), fine=False)
 
 
 def _other_orders(axes: Sequence[str], width: int) -> Iterator[tuple[list[int], str]]:
@@ -187,77 +275,71 @@ def _other_orders(axes: Sequence[str], width: int) -> Iterator[tuple[list[int], 
     same = list(range(width))
     orders: Iterable[Iterable[int]] = itertools.permutations(same)
     if width > ALL_ORDERS:
-        orders = ([{i: j, j: i}.get(k, k) for k in same] for i, j in itertools.combinations(same, 2))
-    for order in map(list, orders if width <= SWAPS else ()):
+        orders = (_swapped(same, i, j) for i, j in itertools.combinations(same, 2))
+    if width > SWAPS:
+        return
+    for order in map(list, orders):
         if order != same:
             yield order, ", ".join(axes[order.index(slot)] for slot in same)
 
 
-def _reordered(
-    estimate: list[int] | None = None, covariance: list[int] | None = None, convention: str | None = None
-) -> Change:
-    """Columns of the estimates, components of their covariance, and its error, in place of others where given."""
-
-    def change(p: Poses) -> Poses:
-        if estimate is not None:
-            p = replace(p, estimate=p.estimate[:, estimate])
-        if covariance is not None:
-            p = replace(p, covariance=submatrices(p.covariance, covariance))
-        return replace(p, convention=convention or p.convention)
-
-    return change
+def _swapped(order: Sequence[int], i: int, j: int) -> list[int]:
+    """An order with two of its places swapped."""
+    swapped = list(order)
+    swapped[i], swapped[j] = order[j], order[i]
+    return swapped
 
 
 def _orders(convention: str) -> Iterator[Guess]:
-    swapped = [3, 4, 5, 0, 1, 2]
+    """Blocks of the covariance in the other order, other conventions of the error, and both."""
+    swapped = _components([3, 4, 5, 0, 1, 2])
     turned = "the covariance has its two blocks in the other order (--covariance-order)"
-    yield Guess(turned, _reordered(None, swapped))
+    yield Guess(turned, changed(covariance=swapped))
     for other in SPATIAL:
         if other != convention:
             guess = _of_error(other)
             yield guess
-            yield Guess(f"{guess.text} and {turned}", _reordered(None, swapped, other))
+            yield Guess(f"{guess.text} and {turned}", changed(covariance=swapped, convention=_declared(other)))
 
 
 def _of_error(convention: str) -> Guess:
-    return Guess(f"the error is '{convention}' (--error {convention})", _reordered(convention=convention))
+    return Guess(f"the error is '{convention}' (--error {convention})", changed(convention=_declared(convention)))
 
 
 def _quaternions() -> Iterator[Guess]:
-    first = [0, 1, 2, 4, 5, 6, 3]
+    first = _columns([0, 1, 2, 4, 5, 6, 3])
     for of, names in OF.items():
         words = f"the quaternions of {of} are w x y z; write them x y z w"
-        yield Guess(words, _changed(names, lambda values: values[:, first]))
+        yield Guess(words, changed(**dict.fromkeys(names, first)))
     back = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
     words = "the quaternions of the estimates turn world into body; invert them"
-    yield Guess(words, _changed(["estimate"], lambda values: values * back))
+    yield Guess(words, changed(estimate=lambda values: values * back))
 
 
-def _changed(names: Sequence[str], function: Callable[[Array], Any]) -> Change:
-    return lambda p: replace(p, **{name: function(getattr(p, name)) for name in names})
+# --- units -------------------------------------------------------------------------------------------
 
 
 def _headings() -> Iterator[Guess]:
-    degrees = np.array([1.0, 1.0, DEGREE])
-    remedy = "; multiply them by pi / 180"
+    """Headings in degrees, of one file or of both, with their variances or without."""
     for of, names in OF.items():
-        volume = float(np.log(DEGREE)) if "truth" in names else 0.0
-        for what in ("", " and their variances"):
-            words = f"the headings of {of}{what} are in degrees{remedy}"
-            change = partial(_scaled, names, degrees, variances=bool(what))
-            yield Guess(words, change, fine="truth" not in names, volume=volume)
+        fields: dict[str, Function] = dict.fromkeys(("estimate", "truth"), _wrapped)
+        fields |= dict.fromkeys(names, _radians)
+        fine = "truth" not in names
+        volume = 0.0 if fine else float(np.log(DEGREE))
+        words = f"the headings of {of}{{}} are in degrees; multiply them by pi / 180".format
+        yield Guess(words(""), changed(**fields), fine=fine, volume=volume)
+        fields["covariance"] = _times(slice(2, 3), DEGREE)
+        yield Guess(words(" and their variances"), changed(**fields), fine=fine, volume=volume)
 
 
-def _scaled(names: Sequence[str], factors: Array, p: Poses, variances: bool = False) -> Poses:
-    """Estimates and truth with the columns of ``names`` times factors, and headings within half a turn."""
-    if variances:
-        p = _weighed(p, slice(0, 3), factors)
-    p = replace(p, estimate=p.estimate.copy(), truth=p.truth.copy())
-    for name in names:
-        getattr(p, name)[:] *= factors
-    for values in (p.estimate, p.truth):
-        values[:, 2] = wrap(values[:, 2])
-    return p
+def _radians(values: Array) -> Array:
+    """Poses in the plane whose headings are in degrees, with headings in rad."""
+    return _wrapped(values * [1.0, 1.0, DEGREE])
+
+
+def _wrapped(values: Array) -> Array:
+    """Poses in the plane with headings within half a turn."""
+    return np.column_stack([values[:, :2], wrap(values[:, 2])])
 
 
 def _units(width: int, angles: slice) -> Iterator[Guess]:
@@ -269,42 +351,15 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
         out[:, part] *= MILLI
         return out
 
+    less = _times(part, MILLI)
     words = "its angles are in degrees (deg^2 for rad^2); multiply them by pi / 180"
-    yield Guess(words, lambda p: _weighed(p, angles, DEGREE))
+    yield Guess(words, changed(covariance=_times(angles, DEGREE)))
     words = "its positions are in millimetres (mm^2 for m^2); divide them by 1000"
-    yield Guess(words, lambda p: _weighed(p, part, MILLI))
+    yield Guess(words, changed(covariance=less))
     remedy = "in millimetres; divide them by 1000"
     words = f"the positions of the estimates and their covariance are {remedy}"
-    yield Guess(words, lambda p: _weighed(replace(p, estimate=shrunk(p.estimate)), part, MILLI))
-    yield Guess(f"the positions of the estimates are {remedy}", _changed(["estimate"], shrunk))
+    yield Guess(words, changed(estimate=shrunk, covariance=less))
+    yield Guess(f"the positions of the estimates are {remedy}", changed(estimate=shrunk))
+    words = f"the positions of the truth are {remedy}"
     volume = width * float(np.log(MILLI))
-    yield Guess(f"the positions of the truth are {remedy}", _changed(["truth"], shrunk), fine=False, volume=volume)
-
-
-def _covariance(function: Callable[[Array], Array]) -> Change:
-    return lambda p: replace(p, covariance=function(p.covariance))
-
-
-def _weighed(p: Poses, part: slice, factor: float | Array) -> Poses:
-    scale = np.ones(p.covariance.shape[-1])
-    scale[part] = factor
-    return replace(p, covariance=p.covariance * scale[:, None] * scale)
-
-
-def _squared(P: Array) -> Array:
-    return np.square(_diagonal(P)) * np.eye(P.shape[-1])
-
-
-def _of_root(P: Array) -> Array:
-    """U'U of the upper triangles U, which are the lower ones L turned over."""
-    U = np.triu(P)
-    return np.asarray(np.swapaxes(U, 1, 2) @ U)
-
-
-def _inverted(P: Array, part: list[int]) -> Array:
-    """Inverses of the rows and columns ``part``; NaN elsewhere and where there is none."""
-    out, block = np.full_like(P, np.nan), submatrices(P, part)
-    finite = np.flatnonzero(np.isfinite(block).all(axis=(1, 2)))
-    regular = finite[np.linalg.slogdet(block[finite])[0] != 0]
-    out[np.ix_(regular, part, part)] = np.linalg.inv(block[regular])
-    return out
+    yield Guess(words, changed(truth=shrunk), fine=False, volume=volume)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment.world_frames import (
+    BodyTransform,
     WorldTransform,
     fitted_body,
     fitted_frame,
@@ -17,58 +17,51 @@ from consistency.referee.readers.alignment.world_frames import (
     on_body,
     spread,
 )
-from consistency.referee.readers.mix_ups.known import Guess, of_finite
+from consistency.referee.readers.mix_ups.known import Guess, changed
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array
 
 ARM = 1e-3  # of the size of the path: shorter lever arms are not named
-TURN, SHIFT = 3.0, 0.05  # degrees, and of the size of the path: frames that differ by less are not named
+TURN = 3.0  # degrees: frames that differ by less are not named
+SHIFT = 0.05  # of the size of the path
 
 
 def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
     """Possible mix-ups of the worlds and bodies of poses, the likelier first; none of other states."""
-    kind, convention = runs[0].manifold, runs[0].convention
+    kind = runs[0].manifold
+    convention = runs[0].convention
     if kind == "vector" or runs[0].covariance.shape[-1] > 6:
         return []
-    axes = _ned(convention) if kind == "spatial" else [_mirrored(convention)]
+    axes = _ned() if kind == "spatial" else [_mirrored(convention)]
     return [*axes, *_frames(runs), *_bodies(runs)]
 
 
-def _ned(convention: str) -> Iterator[Guess]:
+def _ned() -> Iterator[Guess]:
     """A world whose z points down, with a body whose z does so too or not."""
-    north = WorldTransform(Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.zeros(3))
-    down = np.diag([1.0, -1.0, -1.0])
-    turned = {"so3-body": slice(3, 6), "left": slice(0, 6)}.get(convention, slice(0, 0))
-    T = np.eye(6)
-    T[turned, turned] = np.kron(np.eye(2), down)[turned, turned]
-
-    def turned_body(own: Array) -> Array:
-        turn = Rotation.from_quat(own[:, 3:]) * Rotation.from_matrix(down)
-        return np.column_stack([own[:, :3], turn.as_quat()])
-
-    def with_body(p: Poses) -> Poses:
-        p = of_finite(moved(p, north), turned_body)
-        return replace(p, covariance=T @ p.covariance @ T)
-
+    swapped = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    north = WorldTransform(swapped, np.zeros(3))
+    down = BodyTransform(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
     worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
     remedy = "add --world ned{0} if that is the estimates, --truth-world ned{1} if it is the truth"
     yield Guess(f"{worlds}; {remedy.format('', '')}", lambda p: moved(p, north), fine=False)
     remedy = remedy.format(" --body-axes frd", " --truth-body-axes frd")
-    yield Guess(f"{worlds}, and their bodies have z down and z up; {remedy}", with_body, fine=False)
+    words = f"{worlds}, and their bodies have z down and z up; {remedy}"
+    yield Guess(words, lambda p: on_body(moved(p, north), down), fine=False)
 
 
 def _mirrored(convention: str) -> Guess:
+    """A plane whose x is north and y east."""
     A = np.diag([1.0, -1.0, -1.0])
     if convention != "left":
         A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
 
-    def change(p: Poses) -> Poses:
-        x, y, heading = p.estimate.T
-        own = np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
-        return replace(p, estimate=own, covariance=A @ p.covariance @ A.T)
+    def swapped(pose: Array) -> Array:
+        x, y, heading = pose.T
+        return np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
 
     words = "one file is in a plane of x north, y east, the other in one of x east, y north"
     remedy = "add --world ned if that is the estimates, --truth-world ned if it is the truth"
+    change = changed(estimate=swapped, covariance=lambda P: A @ P @ A.T)
     return Guess(f"{words}; {remedy}", change, fine=False)
 
 
@@ -80,7 +73,8 @@ def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
     angle = np.rad2deg(frame.heading)
     several = len(runs) > 1
     if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
-        turn, mode = "", "posyaw"
+        turn = ""
+        mode = "posyaw"
         if abs(angle) > TURN:
             turn = f"turned by {angle:.1f} degrees about z and "
         if several:
@@ -100,7 +94,8 @@ def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
     body = fitted_body(runs)
     if body is None:
         return
-    angle, size = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0, spread(runs)
+    angle = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0
+    size = spread(runs)
     parts = []
     if np.linalg.norm(angle) >= TURN:
         turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"

@@ -11,14 +11,17 @@ from functools import cached_property
 import numpy as np
 
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.readers.truth_matching import Poses, submatrices
+from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 
 MOST = 1000  # estimates that are looked at, of all runs together
 MOST_NUMBERS = 4_000_000  # of their covariances
-MOST_RUNS, LEAST_EACH = 200, 20  # that are looked at, evenly over all, and estimates of each
+MOST_RUNS = 200  # that are looked at, evenly over all
+LEAST_EACH = 20  # estimates of each
 LEAST_GAIN = float(np.log(1e3))  # log likelihood that a cause gains over simple faults, and as much as it has rivals
-ROUNDING, NEGLIGIBLE, NEARLY_ALL = 1e-6, 1e-3, 0.99  # of values, of sigma, of estimates: errors of a file with itself
+ROUNDING = 1e-6  # of values: errors of a file with itself
+NEGLIGIBLE = 1e-3  # of sigma
+NEARLY_ALL = 0.99  # of the estimates
 LEAST = 3  # estimates that show two files to be the same
 RIGHT = 0.4  # decades that components may differ by with the mix-up undone, or more where chance allows it
 SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
@@ -68,15 +71,18 @@ class ReadingFit:
     @cached_property
     def decades(self) -> Array:
         """log10 of the median NEES over that of chi-square, of all n components and of each alone, (1 + n,)."""
-        medians = np.median(np.column_stack([self.nees, np.square(self.own)]), axis=0)
-        right = distributions.chi2.ppf(0.5, np.append(self.n, np.ones(self.n)))
+        squares = np.column_stack([self.nees, np.square(self.own)])
+        medians = np.median(squares, axis=0)
+        dof = np.append(self.n, np.ones(self.n))
+        right = distributions.chi2.ppf(0.5, dof)
         return np.asarray(np.log10(np.maximum(medians, 1e-300) / right))
 
     @cached_property
     def likelihood(self) -> float:
         """Mean log likelihood of an estimate, but for a constant."""
         diagonal = np.diagonal(self.factor, axis1=1, axis2=2)
-        log_det = 2.0 * (np.log(diagonal).sum(axis=1) + np.log(self.sigma).sum(axis=1))
+        log_det = np.log(diagonal).sum(axis=1) + np.log(self.sigma).sum(axis=1)
+        log_det *= 2.0
         return -0.5 * float(self.nees.mean() + log_det.mean())
 
     @cached_property
@@ -94,7 +100,8 @@ class ReadingFit:
         size *= min(1.0, 2.0 * self.scale**2 / (n * variance))
         means = np.array([np.square(w).mean() for w in self.whitened])
         if len(means) >= 8 and means.std() > 0:
-            size = min(size, 2.0 * float(means.mean()) ** 2 * len(means) / (n * float(means.var(ddof=1))))
+            of_runs = 2.0 * float(means.mean()) ** 2 * len(means)
+            size = min(size, of_runs / (n * float(means.var(ddof=1))))
         return max(float(size), 1.0)
 
     def right(self, roughly: bool) -> bool:
@@ -104,11 +111,13 @@ class ReadingFit:
         w = self.w / np.sqrt(self.scale)
         pairs = np.triu_indices(self.n, 1)
         products = (w.T @ w / len(w))[pairs]
-        below = float((self.nees / self.scale < distributions.chi2.ppf(0.5, self.n)).mean())
+        middle = distributions.chi2.ppf(0.5, self.n)
+        below = float((self.nees / self.scale < middle).mean())
         normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]])
         of_axes = _deviance(np.square(self.own).mean(axis=0) / self.scale)
         limit = distributions.chi2.isf(ODD / (len(normal) + len(of_axes)), 1)
-        return bool((self.size * np.append(of_axes, np.square(normal)) <= limit).all())
+        deviances = self.size * np.append(of_axes, np.square(normal))
+        return bool((deviances <= limit).all())
 
     def _alike(self) -> Indices:
         """Components whose NEES is off like that of all, within decades or by chance in few estimates, (n,) of bool."""
@@ -120,12 +129,14 @@ class ReadingFit:
     def is_shown(self) -> bool:
         """Whether all is right, the common factor too, with enough independent estimates to show it."""
         off = self.n * self.size * _deviance(self.scale)
-        return self.size >= ENOUGH and self.right(False) and bool(off <= distributions.chi2.isf(ODD, 1))
+        limit = distributions.chi2.isf(ODD, 1)
+        return self.size >= ENOUGH and self.right(False) and bool(off <= limit)
 
     def near(self) -> float:
         """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
         f = _common_factor(self.scale)
-        return self.likelihood + 0.5 * self.n * (self.scale - self.scale / f - float(np.log(f)))
+        gain = self.scale - self.scale / f - float(np.log(f))
+        return self.likelihood + 0.5 * self.n * gain
 
     def is_off(self) -> bool:
         """Whether another covariance explains the errors better by what a mix-up has to gain at least."""
@@ -148,15 +159,18 @@ class ReadingFit:
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
-        constant, growing = self.error.mean(axis=0) / self.sigma, np.tile(self.own.mean(axis=0), (len(self.own), 1))
-        gains = [self._with_bias(constant), self._with_bias(growing), *map(self._with_factor, groups)]
-        return self.likelihood + max(gains)
+        constant = self.error.mean(axis=0) / self.sigma
+        growing = np.tile(self.own.mean(axis=0), (len(self.own), 1))
+        of_bias = map(self._with_bias, (constant, growing))
+        of_factor = map(self._with_factor, groups)
+        return self.likelihood + max(*of_bias, *of_factor)
 
     def _with_bias(self, bias: Array) -> float:
         """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
         size = float(np.sqrt(np.square(bias).mean(axis=0)).max())
         shift = _solved(self.factor, bias * min(1.0, BIAS / max(size, 1e-300)))
-        after = float(np.square(self.w - shift).sum(axis=1).mean()) / self.n
+        squares = np.square(self.w - shift).sum(axis=1)
+        after = float(squares.mean()) / self.n
         f = _common_factor(after)
         return 0.5 * self.n * (self.scale - after / f - float(np.log(f)))
 
@@ -172,8 +186,10 @@ class ReadingFit:
         mixed = float((self.w * part).sum(axis=1).mean())
         alone = float(np.square(part).sum(axis=1).mean())
         a = f**-0.5 - 1.0
-        after = np.maximum(self.n * self.scale + 2.0 * a * mixed + a**2 * alone, 1e-300) / self.n
-        gains = self.n * (self.scale - 1.0 - np.log(after)) - len(group) * np.log(f)
+        total = self.n * self.scale + 2.0 * a * mixed + a**2 * alone
+        after = np.maximum(total, 1e-300) / self.n
+        gains = self.n * (self.scale - 1.0 - np.log(after))
+        gains -= len(group) * np.log(f)
         return 0.5 * float(gains.max())
 
 
@@ -185,7 +201,8 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     P = np.concatenate([covariance for _, covariance in runs])
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
-        good = np.isfinite(errors).all(axis=1) & np.isfinite(P).all(axis=(1, 2)) & (variance > 0).all(axis=1)
+        good = finite_rows(errors) & finite_rows(P)
+        good &= (variance > 0).all(axis=1)
     sigma = np.sqrt(variance[good])
     R = P[good]
     R /= sigma[:, :, None] * sigma[:, None, :]
@@ -194,14 +211,16 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     if not good.any():
         return None
     if not definite.all():
-        L, sigma = L[definite], sigma[definite]
+        L = L[definite]
+        sigma = sigma[definite]
     error = errors[good]
     w = np.full(errors.shape, np.nan)
     w[good] = _solved(L, error / sigma)
-    whitened, start = [], 0
+    whitened = []
+    start = 0
     for own, _ in runs:
         part = w[start : start + len(own)]
-        part = part[np.isfinite(part).all(axis=1)]
+        part = part[finite_rows(part)]
         if len(part):
             whitened.append(part)
         start += len(own)
@@ -236,24 +255,32 @@ def _solved(L: Array, x: Array) -> Array:
         return np.asarray(np.linalg.solve(L, x[..., None])[..., 0])
     from scipy.linalg import solve_triangular
 
-    return np.array([solve_triangular(one, vector, lower=True) for one, vector in zip(L, x, strict=True)])
+    solved = []
+    for one, vector in zip(L, x, strict=True):
+        solved.append(solve_triangular(one, vector, lower=True))
+    return np.array(solved)
 
 
 def _memory(runs: Sequence[Array]) -> float:
     """1 + 2 sum over lags l of (1 - l / k) rho_l^2 of a component, over all runs, the largest; k is the longest run."""
-    k, n = max(map(len, runs)), runs[0].shape[1]
-    total, pairs = np.zeros((k, n)), np.zeros((k, 1))
+    k = max(map(len, runs))
+    n = runs[0].shape[1]
+    total = np.zeros((k, n))
+    pairs = np.zeros((k, 1))
     for run in runs:
         own = len(run)
         transform = np.fft.rfft(run, 2 * own, axis=0)
-        total[:own] += np.fft.irfft(transform * transform.conj(), 2 * own, axis=0)[:own]
+        products = np.fft.irfft(transform * transform.conj(), 2 * own, axis=0)
+        total[:own] += products[:own]
         pairs[:own, 0] += own - np.arange(own)
     if not (total[0] > 0).all():
         return float(k)
     rho = total / np.maximum(pairs, 1) * (pairs[0] / total[0])
     square = rho**2 - 1.0 / np.maximum(pairs, 1)  # less what chance makes
-    longer = (1.0 - np.arange(1, k) / k)[:, None] * square[1:]
-    return max(1.0, float((1.0 + 2.0 * longer.sum(axis=0)).max()))
+    share = 1.0 - np.arange(1, k) / k
+    longer = share[:, None] * square[1:]
+    memory = 1.0 + 2.0 * longer.sum(axis=0)
+    return max(1.0, float(memory.max()))
 
 
 # --- the files as they were declared -----------------------------------------------------------------
@@ -265,7 +292,10 @@ def is_plausible(runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> 
     some = thinned(runs, shift)
     if is_same(some):
         return False
-    declared = fit_of([(p.errors()[:, judged], submatrices(p.covariance, judged)) for p in some])
+    pairs = []
+    for p in some:
+        pairs.append((p.errors()[:, judged], submatrices(p.covariance, judged)))
+    declared = fit_of(pairs)
     return declared is not None and not declared.is_off()
 
 
@@ -273,7 +303,8 @@ def thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
     """Some estimates of some runs, without those that are not finite."""
     most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
     runs = runs[:: math.ceil(len(runs) / min(MOST_RUNS, most))]
-    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, most // len(runs)))
+    share = most // len(runs)
+    each = max(min(MOST, most) // len(runs), min(LEAST_EACH, share))
     return [p.later(shift).some(each).sound() for p in runs]
 
 
@@ -281,11 +312,13 @@ def is_same(runs: Sequence[Poses]) -> bool:
     """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
     same = total = 0
     for p in runs:
-        rounding = ROUNDING * max(1.0, float(np.abs(p.truth).max(initial=0.0)))
+        largest = float(np.abs(p.truth).max(initial=0.0))
+        rounding = ROUNDING * max(1.0, largest)
         p = p.matched()
         error = np.abs(p.errors())
         with np.errstate(invalid="ignore"):
-            sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
-            same += int(((error <= rounding) & (error <= NEGLIGIBLE * sigma)).all(axis=1).sum())
+            sigma = np.sqrt(p.variances)
+            equal = (error <= rounding) & (error <= NEGLIGIBLE * sigma)
+        same += int(equal.all(axis=1).sum())
         total += len(error)
     return total >= LEAST and same >= NEARLY_ALL * total

@@ -43,14 +43,16 @@ def record_of_arrays(
     if independent:
         _require_rows({key: array.shape for key, array in arrays.items()})
         arrays = {key: array[:, None] for key, array in arrays.items()}
-    shape, wanted = arrays[first].shape, ["runs", "steps"]
+    shape = arrays[first].shape
+    wanted = ["runs", "steps"]
     if first == "errors":
         wanted.append("n")
     if len(shape) != len(wanted) or 0 in shape:
         text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
         if len(shape) == len(wanted) - 1:
             names = [key for key in given if key != "dof"]
-            one, row = "[None] and ".join(names), "[:, None] and ".join(names)
+            one = "[None] and ".join(names)
+            row = "[:, None] and ".join(names)
             text += (
                 f": {one}[None] {is_or_are(len(names))} one run of many steps; {row}[:, None], or independent=True of "
                 "cs.judge, says that each row is a run of its own, which the steps of a log are not"

@@ -45,7 +45,8 @@ def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estima
         raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
     column = column_of(r.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
-    runs, start = [], 0
+    runs = []
+    start = 0
     for p in e.runs:
         end = start + len(p.t)
         runs.append(replace(p, by=column.values[start:end]))
@@ -76,7 +77,10 @@ def in_groups(
 def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
     """The column, marked where its values are those of a judged component of the truth or the estimate, or a sigma."""
     columns = _columns_of(e, judged)
-    values, truth, estimate, P = [], [], [], []
+    values = []
+    truth = []
+    estimate = []
+    P = []
     for p in pairs:
         some = p.pairs(_some(len(p.t), len(pairs)))
         assert some.by is not None
@@ -102,7 +106,8 @@ def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
 def _some(count: int, parts: int = 1) -> Indices:
     """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
     most = max(ENOUGH // parts, 2)
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.int64))
+    places = np.linspace(0, max(count - 1, 0), min(count, most))
+    return np.unique(places.astype(np.int64))
 
 
 def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
@@ -123,7 +128,8 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     counted = np.isfinite(record.nees)
     if not counted.any():
         return record
-    run, step = (places[_some(int(counted.sum()))] for places in np.nonzero(counted))
+    some = _some(int(counted.sum()))
+    run, step = (places[some] for places in np.nonzero(counted))
     error = None
     if record.error is not None:
         error = record.error[run, step]
@@ -134,7 +140,8 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
             "only called so"
         )
     try:
-        groups = groups_of(replace(column, values=record.by), BINS if r.bins is None else r.bins, counted)
+        bins = BINS if r.bins is None else r.bins
+        groups = groups_of(replace(column, values=record.by), bins, counted)
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
@@ -152,12 +159,18 @@ def record_in_groups(record: Record, r: Reading) -> Record:
     cells = record.by
     if r.by_file is not None:
         sheet = _sheet(r)
-        cells = np.stack([_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers])
+        of_runs = [_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers]
+        cells = np.stack(of_runs)
     if cells is None:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
-    column = column_of(r.by, cells)
-    column = replace(column, outcome=selects_on_outcome(column, record.axes))
-    return grouped(replace(record, by=column.values), column, r)
+    return _by_cells(record, r.by, cells, r)
+
+
+def _by_cells(record: Record, name: str, cells: Array, r: Reading, option: str = "--by") -> Record:
+    """The record with groups of the cells of a column, (runs, steps)."""
+    column = column_of(name, cells)
+    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
+    return grouped(replace(record, by=column.values), column, r, option)
 
 
 def with_groups(
@@ -180,11 +193,10 @@ def with_groups(
         raise InputError(f"by: {record.name} {NO_TRUTH}")
     ((name, values),) = by.items()
     try:
-        column = column_of(name, on_steps(values, record.nees.shape))
+        cells = on_steps(values, record.nees.shape)
     except ValueError as wrong:
         raise InputError(f"by: {wrong}") from None
-    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
-    return grouped(replace(record, by=column.values), column, Reading(bins=bins), "by")
+    return _by_cells(record, name, cells, Reading(bins=bins), "by")
 
 
 # --- a table of its own -------------------------------------------------------------------------------
@@ -198,8 +210,8 @@ def _sheet(r: Reading) -> TableRows:
     InputError
         It lacks one of them.
     """
-    from consistency.referee.readers.formats.other_names import with_clock
     from consistency.referee.readers.formats.sheet import read_sheet
+    from consistency.referee.readers.formats.table_columns import with_clock
 
     assert r.by is not None
     assert r.by_file is not None

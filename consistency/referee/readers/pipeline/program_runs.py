@@ -25,9 +25,8 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.readers.options import Reading, flag_of
-from consistency.referee.readers.pipeline.kept_numbers import NUMBERS, keep_numbers, kept_numbers
 from consistency.referee.readers.pipeline.records import records_of
-from consistency.referee.readers.pipeline.run_folders import merged
+from consistency.referee.readers.pipeline.run_folders import NUMBERS, keep_numbers, kept_numbers, merged
 from consistency.referee.readers.places import CutNote, listed
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.system.folders import read_manifest
@@ -147,10 +146,8 @@ class ProgramStudy:
         """How many runs are there, where some are missing."""
         if self.manifest["complete"]:
             return ""
-        there = str(len(runs_in(self.folder)))
-        if self.manifest["runs"]:
-            there += f" of {self.manifest['runs']}"
-        return f"only {there} runs are there"
+        of = f" of {self.manifest['runs']}" if self.manifest["runs"] else ""
+        return f"only {len(runs_in(self.folder))}{of} runs are there"
 
     def files_of(self, run: ProgramRun, r: Reading) -> tuple[Path, Reading]:
         """The estimates of a run, and the options by which they are read, with its own truth.
@@ -160,7 +157,8 @@ class ProgramStudy:
         """
         own: dict[str, Any] = {}
         for name in r.given(PATHS):
-            path, base = str(getattr(r, name)), run.folder
+            path = str(getattr(r, name))
+            base = run.folder
             if "input" in run.values and is_recorded(path):
                 base = Path(run.values["here"])
             own[name] = base / filled(path, run.known)
@@ -221,7 +219,9 @@ class Runs:
     """
 
     def __init__(self, study: ProgramStudy, r: Reading, found_in: Reader) -> None:
-        self.study, self.options, self._found_in = study, r, found_in
+        self.study = study
+        self.options = r
+        self._found_in = found_in
         self.found: dict[int, Sequence[Estimator]] = {}
         self.failed: dict[int, str] = {}
         self.trials: dict[int, str] = {}
@@ -267,7 +267,8 @@ class Runs:
         """
         if self.study.manifest.get("inputs"):
             return {}
-        early, ends = {}, {}
+        early = {}
+        ends = {}
         for run in runs:
             ends[run], late = self._ends[run]
             if late:
@@ -332,9 +333,8 @@ def failures_in_words(records: Sequence[Record], folder: Path) -> list[str]:
     for record in records:
         for failure in record.failures:
             kinds.setdefault(kind_of_failure(failure.reason), {})[failure.run] = failure.reason
-    if not kinds:
-        return []
-    runs, sentences = runs_in(folder), []
+    runs = runs_in(folder) if kinds else {}
+    sentences = []
     for of_runs in kinds.values():
         first, why = min(of_runs.items())
         which = f"{plural(len(of_runs), 'run')} failed ({listed(sorted(of_runs))})"
@@ -362,9 +362,8 @@ def _nothing(path: Path, option: str, run: ProgramRun) -> str:
     if option != "--estimates" and here.exists():
         return f"the program wrote no {relative}; for the one where you stand write {option} {{here}}/{relative}"
     others = sorted({each.name for each in run.folder.iterdir()} - {LOG, RUN_FILE})
-    if not others:
-        return f"the program wrote no {relative} ({option}), and nothing else"
-    return f"the program wrote no {relative} ({option}); it wrote {', '.join(others[:5])}"
+    wrote = f"; it wrote {', '.join(others[:5])}" if others else ", and nothing else"
+    return f"the program wrote no {relative} ({option}){wrote}"
 
 
 def _without_folder(one: Estimator, folder: Path) -> Estimator:
@@ -395,7 +394,8 @@ def _end_of(p: Poses) -> tuple[float, str]:
 
 def _digest(found: Sequence[Estimator]) -> str:
     """Digest of the truth of a run."""
-    p, digest = found[0].runs[0], hashlib.sha256()
+    p = found[0].runs[0]
+    digest = hashlib.sha256()
     for array in (p.true_t, p.truth):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]

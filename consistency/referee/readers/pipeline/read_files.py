@@ -119,8 +119,9 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    named = path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns))
-    return named or is_plane(path, r.columns)
+    if path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns)):
+        return True
+    return is_plane(path, r.columns)
 
 
 def _is_trajectory(path: Path, r: Reading) -> bool:
@@ -219,7 +220,8 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
             return frame_rows(table, name)
         return None if table is None else Path(table)
 
-    sheet, true = rows(estimates, "estimates"), rows(truth, "truth")
+    sheet = rows(estimates, "estimates")
+    true = rows(truth, "truth")
     r = checked_options(replace(reading, truth=cast(Any, true)))
     refuse_options(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
@@ -345,7 +347,8 @@ def _by_kind(estimates: Path, r: Reading) -> list[Record]:
         of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
         notes.insert(0, f"{r.truth}: {of}")
     if any(notes):
-        records[0] = replace(records[0], notes=(*filter(None, notes), *records[0].notes))
+        first = records[0]
+        records[0] = replace(first, notes=(*filter(None, notes), *first.notes))
     return records
 
 
@@ -376,7 +379,8 @@ def checked_options(r: Reading) -> Reading:
         raise InputError(f"--error {r.error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
     if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
         raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
-    if r.lever_arm is not None and not (len(r.lever_arm) == 3 and all(map(math.isfinite, r.lever_arm))):
+    arm = r.lever_arm
+    if arm is not None and not (len(arm) == 3 and all(map(math.isfinite, arm))):
         raise InputError("--lever-arm: must be three numbers x,y,z, in m")
     offset = r.time_offset
     if isinstance(offset, int):

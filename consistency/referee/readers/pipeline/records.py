@@ -18,7 +18,7 @@ from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
-from consistency.referee.readers.runs_to_record import Track, assemble, in_columns, not_estimated
+from consistency.referee.readers.runs_to_record import Track, assemble, estimated_components, in_columns
 from consistency.referee.readers.truth_matching import (
     AXES,
     ROUNDING,
@@ -27,6 +27,7 @@ from consistency.referee.readers.truth_matching import (
     Poses,
     common_steps,
     common_times,
+    finite_rows,
 )
 from consistency.referee.types import Array
 
@@ -36,10 +37,6 @@ if TYPE_CHECKING:
 OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
-STILL = (
-    "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
-    "robot in the plane"
-)
 
 
 def records_of(e: Estimator, r: Reading) -> list[Record]:
@@ -56,21 +53,23 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     if e.innovations_alone and r.by is None:
         return [_innovations(e)]
     require_radians(str(e.path), e.runs)
-    judged, column = _judged(e, r), None
-    if r.by is not None:
-        from consistency.referee.readers.pipeline.by_column import with_values
-
-        e, column = with_values(e, r, judged)
-    relative, pairs = windows_asked(r), list[Poses]()
-    if relative is not None:
-        records = [_record_of_windows(e, judged, r, relative)]
-    else:
-        records, pairs = _records_of_poses(e, judged, r)
-    if column is None:
+    judged = _judged(e, r)
+    if r.by is None:
+        records, _ = _records(e, judged, r)
         return records
-    from consistency.referee.readers.pipeline.by_column import in_groups
+    from consistency.referee.readers.pipeline.by_column import in_groups, with_values
 
+    e, column = with_values(e, r, judged)
+    records, pairs = _records(e, judged, r)
     return in_groups(records, column, e, pairs, r)
+
+
+def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
+    """Records of motions over windows or of poses, and the estimates beside their truth of the latter."""
+    relative = windows_asked(r)
+    if relative is not None:
+        return [_record_of_windows(e, judged, r, relative)], []
+    return _records_of_poses(e, judged, r)
 
 
 def windows_asked(r: Reading) -> Relative | None:
@@ -94,20 +93,23 @@ def _judged(e: Estimator, r: Reading) -> list[int]:
     else:
         judged = list(range(len(e.axes)))
     if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
-        judged = [i for i in judged if i < len(AXES) or any(p.covariance[:, i, i].any() for p in e.runs)]
+        stated = np.any([p.variances.any(axis=0) for p in e.runs], axis=0)
+        judged = [i for i in judged if i < len(AXES) or stated[i]]
     return judged
 
 
 def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
     """Records of the poses of an estimator, and the estimates of each run that they judge, beside their truth."""
-    runs, shift = e.runs, 0.0
+    runs = e.runs
+    shift = 0.0
     of_clocks: list[str] = []
     of_alignment: dict[str, Any] = {}
     if r.align is not None:
         from consistency.referee.readers.alignment.residuals import clocks_and_frames
 
         shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
-        runs, of_alignment = moved.runs, moved.of_record
+        runs = moved.runs
+        of_alignment = moved.of_record
         of_clocks += moved.notes
     elif not runs[0].numbered:
         from consistency.referee.readers.clock_offset import clock_shift
@@ -125,7 +127,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     if e.in_space:
         notes += _space_notes(e, pairs, errors)
         if r.axes is None:
-            judged, still = _estimated(e, errors, judged)
+            judged, still = estimated_components(e, errors, judged)
             notes += still
     causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
@@ -140,13 +142,15 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         part = [i for i in range(len(e.axes))[group] if i in judged]
         if not part:
             continue
-        some, axes = [track.part(part) for track in tracks], tuple(e.axes[i] for i in part)
+        some = [track.part(part) for track in tracks]
+        axes = tuple(e.axes[i] for i in part)
         record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
         record = replace(record, causes=tuple(causes), **of_alignment)
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
-        notes, causes = [], []
+        notes = []
+        causes = []
     return records, pairs
 
 
@@ -168,7 +172,8 @@ def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
         raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
     found = found.pairs(found.stated)
     if found.numbered and found.clock is not None and found.true_clock is not None:
-        t, true_t = found.clock, found.true_clock
+        t = found.clock
+        true_t = found.true_clock
         where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
         refuse(
             np.abs(t - true_t) > r.tolerance + ROUNDING,
@@ -204,8 +209,8 @@ def _is_cut(p: Poses, whole: Poses) -> bool:
     if len(p.t) < 2 or p.t[-1] != whole.t[-1]:
         return False
     before, last = classify(p.covariance[-2:], ROUNDED)
-    finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
-    return bool(finite and before == Validity.VALID and last != Validity.VALID)
+    is_finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
+    return bool(is_finite and before == Validity.VALID and last != Validity.VALID)
 
 
 # --- what is found -----------------------------------------------------------------------------------
@@ -213,11 +218,12 @@ def _is_cut(p: Poses, whole: Poses) -> bool:
 
 def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> list[str]:
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
-    notes, what = [], "no truth"
-    total, left_out, furthest = 0, 0, 0.0
+    notes = []
+    what = "no truth"
+    total = sum(len(p.t) for p in runs)
+    left_out = total - sum(len(p.t) for p in pairs)
+    furthest = 0.0
     for p, found in zip(runs, pairs, strict=True):
-        total += len(p.t)
-        left_out += len(p.t) - len(found.t)
         if not p.stated.all():
             what = "no truth or no covariance"
         if found.apart is not None:
@@ -252,13 +258,11 @@ def _space_notes(e: Estimator, pairs: Sequence[Poses], errors: Sequence[Array]) 
 def _bent(p: Poses) -> Array:
     """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
     assert p.bend is not None
-    sigma = np.sqrt(np.abs(_variances(p)[:, :3]).mean(axis=1))
+    sigma = np.sqrt(np.abs(p.variances[:, :3]).mean(axis=1))
     bent = np.zeros(len(sigma))
-    return np.asarray(np.divide(p.bend, sigma, out=bent, where=(sigma > 0) & (p.bend > 1e-9)))
-
-
-def _variances(p: Poses) -> Array:
-    return np.diagonal(p.covariance, axis1=1, axis2=2)
+    some = (sigma > 0) & (p.bend > 1e-9)
+    bent[some] = p.bend[some] / sigma[some]
+    return bent
 
 
 def _largest_median(of_runs: Iterable[Array]) -> float:
@@ -269,21 +273,6 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
         if len(finite):
             largest = max(largest, float(np.median(finite)))
     return largest
-
-
-def _estimated(e: Estimator, errors: Sequence[Array], judged: Sequence[int]) -> tuple[list[int], list[str]]:
-    """Components, of those judged, that a robot in the plane estimates, too; and a note on the others."""
-    part = np.array(judged)
-    variances, of_part = [], []
-    for p, error in zip(e.runs, errors, strict=True):
-        variances.append(_variances(p)[p.stated][:, part])
-        of_part.append(error[:, part])
-    idle = not_estimated(of_part, variances)
-    if not idle.any():
-        return list(judged), []
-    names = ", ".join(np.array(e.axes)[part[idle]])
-    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
-    return part[~idle].tolist(), [note]
 
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
@@ -314,15 +303,26 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
-    path, t, width = None, None, e.position
+    path = t = None
+    width = e.position
     if width:
-        path = np.stack([p.truth[:, :width], p.estimate[:, :width]], axis=1)
+        true = p.truth[:, :width]
+        path = np.stack([true, p.estimate[:, :width]], axis=1)
     if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
         t = p.seconds
     return Track(
-        p.run, np.arange(len(p.t)), p.place, error, p.covariance, p.nis, p.nis_dof, by=p.by, t=t,
-        truth_covariance=p.true_covariance, path=path,
-    )  # fmt: skip
+        p.run,
+        np.arange(len(p.t)),
+        p.place,
+        error,
+        p.covariance,
+        p.nis,
+        p.nis_dof,
+        by=p.by,
+        t=t,
+        truth_covariance=p.true_covariance,
+        path=path,
+    )
 
 
 def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -> tuple[list[Track], Array, list[str]]:
@@ -333,7 +333,9 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     if e.t is not None:
         columns = [p.t.astype(np.int64) for p in pairs]
         return in_columns(tracks, columns), e.t, []
-    keys, seconds, some = [], [], []
+    keys = []
+    seconds = []
+    some = []
     for p, track in zip(pairs, tracks, strict=True):
         if len(p.t):
             keys.append(p.t)
@@ -359,41 +361,36 @@ def _innovations(e: Estimator) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        error = np.where(np.isfinite(p.estimate).all(axis=1), 0.0, np.nan)[:, None]
-        tracks.append(Track(p.run, np.arange(len(p.t)), p.place, error, nis=p.nis, nis_dof=p.nis_dof, t=p.clock))
+        error = np.where(finite_rows(p.estimate), 0.0, np.nan)[:, None]
+        tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", [*e.notes, *numbering])
+    notes = [*e.notes, *numbering]
+    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
     return replace(record, error=None, dof=0)
 
 
 def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
     """The record of motions over windows."""
-    from consistency.referee.readers.pipeline.relative_motions import Stretch, causes_of_motions, relative_recording
+    from consistency.referee.readers.pipeline.relative_motions import causes_of_motions, relative_recording
 
     if e.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
-    runs, pairs, stretches = [], [], []
+    runs = []
     for p in e.runs:
         if relative.motions:
             bare = np.append(False, ~p.stated[1:])
             refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
         elif p.cross is not None and not p.stated.all():
             p = p.of_rows(np.flatnonzero(p.stated))
-        known = p.known(r.shift)
-        if not len(known.rows):
-            raise _nothing_known(e, p, r.shift)
+        p = p.later(r.shift)
+        if not len(p.known().rows):
+            raise _nothing_known(e, p, 0.0)
         runs.append(p)
-        pairs.append(p.matched(r.shift))
-        stretches.append(
-            Stretch(
-                p.run, str(p.files[0]), p.place, p.seconds + r.shift, p.estimate, p.covariance, p.cross, known.rows,
-                known.truth, p.convention, p.by,
-            )
-        )  # fmt: skip
     axes = AXES
-    if stretches[0].d == 2:  # archives do not name them
+    if runs[0].d == 2:  # archives do not name them
         axes = ("x", "y", "heading")
-    record = relative_recording(e.name, str(e.covariances or e.path), stretches, axes, judged, relative)
-    causes = causes_of_motions(e.said, stretches, axes, judged, relative)
-    notes = (*e.notes, *_left_out(e, runs, pairs), *record.notes, *causes)
+    record = relative_recording(e.name, str(e.covariances or e.path), runs, axes, judged, relative)
+    causes = causes_of_motions(e.said, runs, axes, judged, relative)
+    left_out = _left_out(e, runs, [p.matched() for p in runs])
+    notes = (*e.notes, *left_out, *record.notes, *causes)
     return replace(record, notes=notes, causes=tuple(causes))

@@ -19,14 +19,12 @@ from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, plu
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.lie_groups import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.mix_ups.hints import Pairs, hints
-from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, assemble, in_columns
-from consistency.referee.readers.truth_matching import Change, Manifold, Poses, at, common_times
+from consistency.referee.readers.truth_matching import Change, Poses, at, common_times, finite_rows
 from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
 KIND = "left"
-MANIFOLDS: dict[int, Manifold] = {2: "planar", 3: "spatial"}
 DOUBTS = {  # by whether sizes of errors depend on each other, and whether they are alike: what they do, and its cause
     (True, True): ("are of like size", "conditions that last longer than a window"),
     (True, False): ("are of unlike size", "what takes turns from window to window"),
@@ -35,30 +33,6 @@ DOUBTS = {  # by whether sizes of errors depend on each other, and whether they 
 }
 SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """One run before its windows are taken; N rows, k of which have a truth."""
-
-    run: int
-    file: str
-    place: Places  # (N,)
-    t: Array  # (N,), s, or NaN
-    estimate: Array  # (N, m), poses, or motions since the row before
-    covariance: Array  # (N, n, n), NaN where the file has none
-    cross: Array | None  # (N, n, n), E e_before e', of the errors of the row before and of this row
-    rows: Indices  # (k,), with truth
-    truth: Array  # (k, m)
-    convention: str  # of the error that the covariances are of
-    by: Array | None = None  # (N,), values of the column that makes groups
-
-    @property
-    def d(self) -> int:
-        """2 in the plane, 3 in space."""
-        if self.covariance.shape[-1] == 3:
-            return 2
-        return 3
 
 
 @dataclass(frozen=True)
@@ -72,82 +46,104 @@ class Windows:
     left_out: int
 
 
-def windows_of(stretch: Stretch, relative: Relative) -> Windows:
-    """Errors of the motions over windows, with their covariances to first order.
+def windows_of(p: Poses, relative: Relative) -> Windows:
+    """Errors of the motions over windows of a run, with their covariances to first order.
 
-    Independent motions M_k = D_k Exp(e_k) make up the window's motion D Exp(sum Ad(D_k+1 ... D_j)^-1 e_k): poses are
-    compounded as in Barfoot (2017), State Estimation for Robotics, sec. 7.3.3. Errors e_i and e_j of two poses with a
-    joint covariance make up D Exp(e_j - Ad(D)^-1 e_i).
+    Estimates are poses, or motions since the row before. Independent motions M_k = D_k Exp(e_k) make up the window's
+    motion D Exp(sum Ad(D_k+1 ... D_j)^-1 e_k): poses are compounded as in Barfoot (2017), State Estimation for
+    Robotics, sec. 7.3.3. Errors e_i and e_j of two poses with a joint covariance make up D Exp(e_j - Ad(D)^-1 e_i).
 
     Raises
     ------
     InputError
         No window fits, a covariance is missing, or cross-covariances do not reach over a window.
     """
-    s = stretch
-    if not relative.motions and s.cross is None:
-        raise InputError(f"{s.file}: --relative: {MARGINAL}")
-    first, last, left_out = windows(s.t, s.truth[:, : s.d], s.rows, relative, s.file)
-    sound = _sound(s, relative)
-    first, last = first[last < sound], last[last < sound]
-    T, true = matrices(s.estimate[int(relative.motions) : sound]), matrices(s.truth)
+    file = str(p.files[0])
+    if not relative.motions and p.cross is None:
+        raise InputError(f"{file}: --relative: {MARGINAL}")
+    known = p.known()
+    t = p.seconds
+    position = known.truth[:, : p.d]
+    first, last, left_out = windows(t, position, known.rows, relative, file)
+    sound = _sound(p, relative)
+    whole = last < sound
+    first = first[whole]
+    last = last[whole]
+    T = matrices(p.estimate[int(relative.motions) : sound])
     if relative.motions:  # from the origin on
-        T = composed(np.concatenate([np.eye(s.d + 1)[None], T]))
-    start, end = np.searchsorted(s.rows, first), np.searchsorted(s.rows, last)
-    D, M = inverse(T[first]) @ T[last], inverse(true[start]) @ true[end]
+        T = composed(np.concatenate([np.eye(p.d + 1)[None], T]))
+    true = matrices(known.truth)
+    start = np.searchsorted(known.rows, first)
+    end = np.searchsorted(known.rows, last)
+    D = inverse(T[first]) @ T[last]
+    M = inverse(true[start]) @ true[end]
     error = log(inverse(D) @ M)
-    covariance = _of_motions(s, T, first, last) if relative.motions else _of_poses(s, T, D, first, last, relative)
-    if sound < len(s.t):  # a broken row ends the run, in a window of its own
-        first, last = np.append(first, max(sound - 1, 0)), np.append(last, sound)
+    covariance = _of_motions(p, T, first, last) if relative.motions else _of_poses(p, T, D, first, last, relative)
+    if sound < len(t):  # a broken row ends the run, in a window of its own
+        first = np.append(first, max(sound - 1, 0))
+        last = np.append(last, sound)
         broken = 0.0
-        if not np.isfinite(s.estimate[sound]).all():
+        if not np.isfinite(p.estimate[sound]).all():
             broken = np.nan
-        error = np.concatenate([error, np.full((1, error.shape[1]), broken)])
-        covariance = np.concatenate([covariance, np.full((1, *s.covariance.shape[1:]), np.nan)])
-    track = Track(s.run, np.arange(len(last)), s.place.at(last), error, covariance, t=s.t[first], by=at(s.by, first))
-    return Windows(track, error, covariance, s.t[last], left_out)
+        error = np.vstack([error, np.full(error.shape[1], broken)])
+        unknown = np.full((1, *p.covariance.shape[1:]), np.nan)
+        covariance = np.concatenate([covariance, unknown])
+    track = Track(
+        p.run,
+        np.arange(len(last)),
+        p.place.at(last),
+        error,
+        covariance,
+        t=t[first],
+        by=at(p.by, first),
+    )
+    return Windows(track, error, covariance, t[last], left_out)
 
 
-def _sound(s: Stretch, relative: Relative) -> int:
+def _sound(p: Poses, relative: Relative) -> int:
     """The first row that is broken; the first row of motions is only where they start."""
-    ok: Array = np.asarray(np.isfinite(s.estimate).all(axis=1) & np.isfinite(s.covariance).all(axis=(1, 2)))
-    if s.cross is not None:
-        ok[1:] &= np.isfinite(s.cross[1:]).all(axis=(1, 2))
+    ok = finite_rows(p.estimate) & finite_rows(p.covariance)
+    if p.cross is not None:
+        ok[1:] &= finite_rows(p.cross[1:])
     if relative.motions:
         ok[0] = True
     return int(np.argmin(np.append(ok, False)))
 
 
-def _of_motions(s: Stretch, T: Array, first: Indices, last: Indices) -> Array:
+def _of_motions(p: Poses, T: Array, first: Indices, last: Indices) -> Array:
     """Covariances of the windows' left errors from independent motions, (W, n, n)."""
     if not len(first):
-        return np.empty((0, *s.covariance.shape[1:]))
+        return np.empty((0, *p.covariance.shape[1:]))
     sizes = last - first
+    begins = np.cumsum(sizes) - sizes
     window = np.repeat(np.arange(len(first)), sizes)
-    rows = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes) + first[window] + 1
-    own = to_left(inverse(T[rows - 1]) @ T[rows], s.convention)
+    rows = np.arange(sizes.sum()) - begins[window] + first[window] + 1
+    own = to_left(inverse(T[rows - 1]) @ T[rows], p.convention)
     J = adjoint(inverse(T[last[window]]) @ T[rows]) @ own
-    return np.asarray(np.add.reduceat(propagated(J, s.covariance[rows]), np.cumsum(sizes) - sizes))
+    return np.asarray(np.add.reduceat(propagated(J, p.covariance[rows]), begins))
 
 
-def _of_poses(s: Stretch, T: Array, D: Array, first: Indices, last: Indices, relative: Relative) -> Array:
+def _of_poses(p: Poses, T: Array, D: Array, first: Indices, last: Indices, relative: Relative) -> Array:
     """Covariances of the windows' left errors from the joint ones of their two ends, (W, n, n)."""
-    assert s.cross is not None
-    if (wide := np.flatnonzero(last - first != 1)).size:
+    assert p.cross is not None
+    sizes = last - first
+    wide = np.flatnonzero(sizes != 1)
+    if len(wide):
         raise InputError(
-            f"{s.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans "
-            f"{(last - first)[wide[0]]} rows, but a cross-covariance reaches one row back; keep only the rows at the "
-            "ends of windows, or take --relative 1"
+            f"{p.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans {sizes[wide[0]]} rows, but "
+            "a cross-covariance reaches one row back; keep only the rows at the ends of windows, or take --relative 1"
         )
-    start, end = to_left(T[first], s.convention), to_left(T[last], s.convention)
+    start = to_left(T[first], p.convention)
+    end = to_left(T[last], p.convention)
     J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
-    cross = s.cross[last]
-    joint = np.block([[s.covariance[first], cross], [np.swapaxes(cross, -1, -2), s.covariance[last]]])
+    cross = p.cross[last]
+    mirrored = np.swapaxes(cross, -1, -2)
+    joint = np.block([[p.covariance[first], cross], [mirrored, p.covariance[last]]])
     return propagated(J, joint)
 
 
 def relative_recording(
-    name: str, file: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+    name: str, file: str, runs: Sequence[Poses], axes: Sequence[str], judged: Sequence[int], relative: Relative
 ) -> Record:
     """The windows of some runs of one estimator as a recording, whose steps are windows.
 
@@ -160,9 +156,12 @@ def relative_recording(
     InputError
         Input that :func:`windows_of` refuses, or a covariance that is singular in every window.
     """
-    found, tracks, times, whitened = [], [], [], []
-    for stretch in stretches:
-        one = windows_of(stretch, relative)
+    found = []
+    tracks = []
+    times = []
+    whitened = []
+    for p in runs:
+        one = windows_of(p, relative)
         found.append(one)
         tracks.append(one.track.part(judged))
         times.append(one.t)
@@ -171,7 +170,7 @@ def relative_recording(
     if np.isfinite(np.concatenate(times)).all():
         columns, t = common_times(times)
         tracks = in_columns(tracks, columns)
-    notes = _notes(name, found, len(axes), stretches[0].convention, relative)
+    notes = _notes(name, found, len(axes), runs[0].convention, relative)
     of = independence(np.concatenate(whitened))
     if relative.independent and of.doubtful:
         notes.append(_doubt(name, of, relative))
@@ -227,7 +226,7 @@ def _widest(found: Sequence[Windows]) -> float:
     P = np.concatenate([one.covariance for one in found])
     first = {3: 2, 6: 3}[P.shape[-1]]
     angles = P[:, first:, first:]
-    angles = angles[np.isfinite(angles).all(axis=(1, 2))]
+    angles = angles[finite_rows(angles)]
     if not len(angles):
         return 0.0
     largest = np.linalg.eigvalsh(angles)[:, -1]
@@ -258,32 +257,25 @@ def _too_few(of: Independence, relative: Relative) -> str:
 
 
 def causes_of_motions(
-    name: str, stretches: Sequence[Stretch], axes: Sequence[str], judged: Sequence[int], relative: Relative
+    name: str, runs: Sequence[Poses], axes: Sequence[str], judged: Sequence[int], relative: Relative
 ) -> list[str]:
     """Mix-ups of motions, or of poses with cross-covariances, without which the errors of the windows fit."""
-    most = SEARCHED // len(stretches)
-    stretches = [replace(s, rows=s.rows[:most], truth=s.truth[:most]) for s in stretches]
-    runs = [_poses_of(s) for s in stretches]
+    some = []
+    for p in runs:
+        known = p.known()
+        most = slice(SEARCHED // len(runs))
+        t = p.t[known.rows[most]]
+        some.append(replace(p, true_t=t, truth=known.truth[most], true_covariance=None, max_dt=0.0))
 
     def errors_without(change: Change) -> Pairs:
         found = []
-        for s, p in zip(stretches, runs, strict=True):
+        for p in some:
             with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
-                q = change(p)
-                cross = s.cross
-                if cross is not None:
-                    cross = change(replace(p, covariance=cross)).covariance
-                changed = replace(s, estimate=q.estimate, covariance=q.covariance, cross=cross, truth=q.truth)
-                one = windows_of(replace(changed, convention=q.convention), relative)
+                changed = change(p)
+                if p.cross is not None:
+                    changed = replace(changed, cross=change(replace(p, covariance=p.cross)).covariance)
+                one = windows_of(changed, relative)
                 found.append((one.error, one.covariance))
         return found
 
-    return hints(name, axes, runs, judged=judged, errors_without=errors_without)
-
-
-def _poses_of(s: Stretch) -> Poses:
-    """The rows of a run as poses or motions, which a change of the reading takes."""
-    return Poses(
-        s.place, s.t, s.estimate, s.covariance, np.ones(len(s.t), bool), s.t[s.rows], s.truth, MANIFOLDS[s.d],
-        s.convention, 0.0,
-    )  # fmt: skip
+    return hints(name, axes, some, judged=judged, errors_without=errors_without)

@@ -92,7 +92,7 @@ def run_command(
     slurm: SlurmOptions = None,
 ) -> None:
     """Run filters on simulated trials or a recorded log."""
-    from consistency.bench.filters.filter_declarations import resolve_filters
+    from consistency.bench.filters.resolve_filters import resolve_filters
     from consistency.bench.runs.analyse_results import analyse
     from consistency.bench.runs.backends.choose_executor import executor_for
     from consistency.bench.runs.montecarlo import run_log, run_trials

@@ -16,7 +16,8 @@ from consistency.bench.challenging.world_scores import ChallengeScorer
 from consistency.bench.challenging.world_space import Point, Space, require_right_belief, space_of
 from consistency.bench.challenging.worst_point_search import RUNGS, Budget, ScoredWorld, ranked, search
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.filter_declarations import name_of, resolve_filters
+from consistency.bench.filters.filter_declarations import name_of
+from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.runs.montecarlo import run_trials

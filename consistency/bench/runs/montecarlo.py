@@ -11,7 +11,8 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.filters.filter_declarations import name_of, own_errors, resolve_filters
+from consistency.bench.filters.filter_declarations import name_of, own_errors
+from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.executor_batches import ExecutorWorkers
 from consistency.bench.runs.isolation.filter_process import Isolation

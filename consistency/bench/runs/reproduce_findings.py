@@ -169,7 +169,7 @@ def _selection(
     if unknown := [name for name in only if name not in known_findings]:
         known = ", ".join([*known_findings, *scripts])
         raise InputError(f"--only {unknown[0]}: no such finding or experiment; known: {known}")
-    selection = []
+    selection: list[tuple[ModuleType, Sequence[str]]] = []
     for module in scripts.values():
         ids = [name for name in module.FINDINGS if not only or name in only]
         if ids and (only or long or not getattr(module, "LONG", False)):

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator
 
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.filter_declarations import resolve_filters
+from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.runs.run_until_decided import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
 from consistency.bench.scenario.truth_and_belief import unknown, with_changes

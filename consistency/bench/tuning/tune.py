@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.filter_declarations import name_of, resolve_filters
+from consistency.bench.filters.filter_declarations import name_of
+from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.analyse_results import analyse
 from consistency.bench.scenario import Belief, Scenario, load_scenario

@@ -15,7 +15,7 @@ import pytest
 from consistency.bench.filters.compiler import disk_cache
 from consistency.bench.filters.compiler.content_key import Content
 from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.filters.filter_declarations import resolve_filters
+from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.runs import missing_kernels
 from consistency.bench.runs.experiment_scripts import experiments
 from consistency.bench.scenario import load_scenario

@@ -56,6 +56,8 @@ def test_the_worst_axis_stands_beside_the_whole(rng, capsys):
     assert verdict.statistics["worst_axis"] == "heading"
     assert verdict.statistics["worst_axis_ratio"] == tuple(interval)
     show(*document({"f": verdict}, reasons=False).opening)
+    assert "worst axis" not in capsys.readouterr().out  # the reasons of a single verdict have it
+    show(*document({"f": verdict, "g": verdict}, reasons=False).opening)
     assert f"ratio of the {beside.replace(':', ': f')}" in capsys.readouterr().out
     few = judged(error[:5])
     assert few.status == "undecided"

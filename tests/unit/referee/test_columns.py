@@ -188,6 +188,14 @@ def test_which_deviations_count():
         assert (named([*SPACE, *more], found.covariance), found.squared) == (expected, squared)
 
 
+def test_numbers_under_another_word_do_not_count_with_those_of_a_covariance():
+    numbers = [f"cov_{i}_{j}" for i, j in itertools.product(range(6), repeat=2)]
+    names = [*SPACE, *numbers, "P11", *(f"twist.covariance{i}" for i in range(36))]
+    found = pose_columns(names, HERE)
+    assert found is not None
+    assert named(names, found.covariance) == numbers
+
+
 # --- tables of planar poses --------------------------------------------------------------------------
 
 

@@ -49,7 +49,7 @@ VARIANCES = ("var_{}", "var{}", "{}_var", "variance_{}")
 LABELS = (("x", "y", "z", "roll", "pitch", "yaw"), ("x", "y", "z", "rx", "ry", "rz"), ("x", "y", "z", "a", "b", "c"))
 MOVING_LABELS = ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")  # behind those of a pose
 CNSPY = "t{}{}"  # of a covariance of a pose; two blocks of it are p{}{} and q{}{}
-NUMBERED = re.compile(r"(.*?)(?:covariance|cov|p)_?(\d+)(?:_(\d+))?")  # pose_covariance_17, cov_0_0, P11
+NUMBERED = re.compile(r"(.*?(?:covariance|cov|p))_?(\d+)(?:_(\d+))?")  # pose_covariance_17, cov_0_0, P11
 
 EUROC_END = ["bax", "bay", "baz"]  # of the 17 columns of EuRoC under short names
 _OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"

@@ -14,7 +14,7 @@ DOCS = ROOT / "docs"
 PAGES = [*DOCS.glob("*.md"), DOCS / "tutorial.ipynb"]  # that a reader is led to; docs/reference is looked up
 ALL = [*DOCS.glob("*.md"), *DOCS.glob("reference/*.md")]
 EXAMPLE = DOCS / "examples/repository"
-LONG = {"fit-covariance.md", "referee.md"}  # up to 3,600 words
+LONG = {"fit-covariance.md"}  # up to 3,600 words
 
 
 def test_the_readme_is_short():

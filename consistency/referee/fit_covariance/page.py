@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
-from consistency.referee.document.blocks import Chapter, Document, Figure
+from consistency.referee.document.blocks import Chapter, Document, Figure, Text
 from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, ZERO, solid, style
 from consistency.referee.fit_covariance.correct import Correction
 from consistency.referee.fit_covariance.correction_text import correction_document
@@ -52,9 +52,11 @@ def page_of(
     caption: str,
     draw: Callable[[], Drawing],
 ) -> Document:
-    """A document with its picture."""
+    """A document with its picture; its first sentence is the answer at the top of the page."""
+    sentence, *further = said.opening
+    assert isinstance(sentence, Text)
     picture = Figure(title, caption, (draw,))
-    return replace(said, chapters=(Chapter("", "", "", (picture,)),))
+    return replace(said, answer=sentence.text, opening=tuple(further), chapters=(Chapter("", "", "", (picture,)),))
 
 
 # --- noise models -----------------------------------------------------------------------------------------------------
@@ -136,7 +138,7 @@ def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
     axes.axvline(1.0, **stroke(EXPECTED))
     for number, values in enumerate(ratios):
         axes.plot(values, np.arange(len(values)), **dots(style(number)))
-    axes.set_xlabel("true over stated covariance")
+    axes.set_xlabel("true / stated")
 
 
 # --- corrections ------------------------------------------------------------------------------------------------------

@@ -108,7 +108,7 @@ def _times(part: slice, factor: float) -> Function:
 def _inverse(poses: Array) -> Array:
     """Inverse poses, where they are finite."""
     finite = finite_rows(poses)
-    out = poses.copy()
+    out: Array = poses.copy()
     out[finite] = vectors(inverse(matrices(poses[finite])))
     return out
 

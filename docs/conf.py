@@ -33,7 +33,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!consistency[.:]).*"),  # types and modules of others, or an alias of arrays
     # in signatures, not public
     (r"py:class", r"consistency\..*\.(DisparityGrowth|Lens|NoiseGroup|Observations|Parts|StepMoments)"),
-    (r"py:class", r"consistency\..*\.(Reading|Results|Sequence|Source|Space|Sweep|Tables)"),
+    (r"py:class", r"consistency\..*\.(Reading|Results|StereoSequence|Source|Space|Sweep|Tables)"),
     # stages of the chain
     (r"py:class", r"consistency\..*\.stages\.(Correspondence|FeatureSelection|ObservationFilter|Tracking)"),
 ]

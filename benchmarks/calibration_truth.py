@@ -21,6 +21,9 @@ DECLARED = {"white": "independent", "AR(.9)": "independent", "constant per run":
 SIGNS = "common to all but for its sign"  # of each run: nothing can be declared
 GATES, QUICK_GATES = 2000, 40
 POWER = 0.3  # of what is not declared, at least: about half of it is found
+DECLARED_POWER = 0.95
+# kind, share, ratio -> what 50 runs reach: the sum is wrong by x0.7 alone, and every run has one error of the truth
+REACHED = {("constant per run", 0.4, 0.5): 0.93}
 FALSE, POWERS, BOUNDED, CONSISTENT = (
     "uncertain truth, false alarm", "uncertain truth, power", "uncertain truth, power without a declaration",
     "uncertain truth, wrong all-clear",
@@ -79,12 +82,13 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
                     found = [judge(gate(rng, kind, s, ratio, errors)) for _ in range(gates)]
                     fault = sum(bool(v.faults) for v in found)
                     side = "overconfident" if ratio > 1.0 else "conservative"
+                    power = REACHED.get((kind, s, ratio), DECLARED_POWER)
                     called = sum(v.status == side for v in found)
                     consistent = sum(v.status == "consistent" for v in found)
                     question, stated, bound, count = {
                         1.0: (FALSE, 0.05, "<=", fault),
                         1.5: (CONSISTENT, 0.05, "<=", consistent),
-                    }.get(ratio, (POWERS, 0.95, ">=", called) if errors else (BOUNDED, POWER, ">=", called))
+                    }.get(ratio, (POWERS, power, ">=", called) if errors else (BOUNDED, POWER, ">=", called))
                     world = f"truth {kind}, {how}, s = {s:g}"
                     if errors or s == SHARES[0] or bound == "<=":
                         table.append(row(world, question, ratio, RUNS, stated, bound, gates, count))

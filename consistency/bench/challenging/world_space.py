@@ -19,6 +19,7 @@ from consistency.bench.simulation.scenario_changes import (
     height_changes,
     in_both,
     odometry_changes,
+    range_changes,
     tilt_changes,
 )
 from consistency.referee.errors import InputError
@@ -280,7 +281,7 @@ CHANGES: dict[str, Callable[[Scenario, Any], Changes]] = {
     "dt": lambda base, dt: {"truth.dt": dt},
     "tilt": tilt_changes,
     "height": height_changes,
-    "range": lambda base, far: {"truth.sensor.range": (base.truth.sensor.range[0], far)},
+    "range": range_changes,
     "baseline": baseline_changes,
 }
 

@@ -81,6 +81,11 @@ def odometry_changes(base: Scenario, factor: float) -> Changes:
     return changes
 
 
+def range_changes(base: Scenario, far: float) -> Changes:
+    """The longest range of the sensor, m."""
+    return {"truth.sensor.range": (base.truth.sensor.range[0], far)}
+
+
 def tilt_changes(base: Scenario, tilt: float) -> Changes:
     """A camera turned to a tilt (deg, positive looks down)."""
     roll, _, heading = _stereo_camera(base).mount.rotation

@@ -17,6 +17,7 @@ from consistency.bench.simulation.scenario_changes import (
     height_changes,
     in_both,
     odometry_changes,
+    range_changes,
     tilt_changes,
 )
 from consistency.referee.errors import InputError
@@ -37,10 +38,6 @@ class Quantity:
 
 def _baseline(base: Scenario) -> float:
     return np.nan if base.truth.sensor.rig is None else base.truth.sensor.rig[1]
-
-
-def _range_changes(base: Scenario, value: float) -> Changes:
-    return {"truth.sensor.range": (base.truth.sensor.range[0], value)}
 
 
 def _density_changes(base: Scenario, value: float) -> Changes:
@@ -78,7 +75,7 @@ def _loops_changes(base: Scenario, value: float) -> Changes:
 
 QUANTITIES: dict[str, Quantity] = {
     "baseline": Quantity("baseline", "m", baseline_changes, _baseline),
-    "range": Quantity("range of landmarks", "m", _range_changes, lambda base: float(base.truth.sensor.range[1])),
+    "range": Quantity("range of landmarks", "m", range_changes, lambda base: float(base.truth.sensor.range[1])),
     "density": Quantity("density of landmarks", "×", _density_changes),
     "odometry": Quantity("noise of the odometry", "×", odometry_changes),
     "speed": Quantity("speed", "m/s", lambda _, value: {"truth.path.speed": value}, lambda base: base.truth.path.speed),

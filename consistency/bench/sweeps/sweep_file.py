@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from consistency.bench.filters import get_filter
 from consistency.bench.filters.resolve_filters import resolve_filters
 from consistency.bench.runs.run_until_decided import plan_of
 from consistency.bench.scenario import Count, Positive, Scenario, Table, data_folder, explain, load_scenario, read_table
@@ -197,8 +196,6 @@ def load_sweep(name: str | Path, filters: Sequence[str] | None = None) -> Sweep:
             file = file.model_copy(update={"filters": list(filters)})
         sweep = sweep_of(path.stem, file, base)
         plan_of(sweep.rule.model_dump() | {"dof": len(POSE)})
-        for filter_ in sweep.filters:
-            get_filter(filter_)
         resolve_filters(sweep.filters, sweep.base.belief)
         _require_cells(sweep)
     except InputError as error:

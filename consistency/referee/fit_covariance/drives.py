@@ -18,14 +18,13 @@ from consistency.referee.readers.formats.file_kinds import (
     is_bag,
     is_plane,
     is_solution,
-    paired,
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import Found, kind_of
+from consistency.referee.readers.pipeline.run_folders import read_table_of_run
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array, Indices
@@ -143,11 +142,8 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
     for path in files:
-        own = r
-        if r.truth is not None:
-            own = replace(r, truth=paired(r.truth, path, "--truth", "table '{}'"))
         stem = path.name.split(".")[0]
-        for poses in _of_one(path, read_tables(path, own, poses_alone=True), r):
+        for poses in _of_one(path, read_table_of_run(path, r, poses_alone=True), r):
             found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
     return found
 

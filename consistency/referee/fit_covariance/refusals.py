@@ -142,12 +142,12 @@ def require_sound(windows: DriveWindows, correct: bool) -> None:
         if rounding < ROUNDED:
             raise InputError(
                 f"rotations of estimate and truth differ by {rounding:.2g} rad, as by rounding, and not by more over "
-                "longer spans: one was taken from the other, so that there is no error of rotations to fit; give those "
+                "longer spans: one was taken from the other, and no error of rotations is left to fit; give those "
                 "that the odometry estimates itself"
             )
         raise InputError(
             f"the squared rotation error grows with the span to the power of {growth.power:.2g} (1 is white noise): "
-            "loops are closed, or a map is used, so that there are no increments; record the live odometry, before "
+            "loops are closed, or a map is used, and these poses hold no increments; record the live odometry, before "
             "loops are closed or a map corrects it"
         )
     turn = body_turn(windows)

@@ -168,7 +168,7 @@ def _require_some(name: str, there: Array, good: Array) -> None:
 
 
 def _gone_of(name: str, shape: tuple[int, ...], gone: Array | None) -> Array:
-    """Steps that are gone among innovations of this shape: none if there are no errors."""
+    """Steps that are gone among innovations of this shape; none without errors."""
     if gone is None:
         return np.zeros(shape[:2], bool)
     if shape[:2] != gone.shape:

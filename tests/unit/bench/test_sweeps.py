@@ -73,6 +73,11 @@ def test_a_grid_changes_truth_and_belief_alike():
     assert cell.text.startswith("baseline 0.6 m, range of landmarks 5 m, density of landmarks ×0.25")
 
 
+def test_filters_of_a_call_take_the_place_of_those_of_the_file():
+    assert len(load_sweep("regime").filters) > 1
+    assert load_sweep("regime", ["ukf-uvd"]).filters == ("ukf-uvd",)
+
+
 def test_keys_of_the_scenario_are_axes_too(at):
     path = edited(at, "odometry = [1.0, 2.0]", 'truth.path.radius = [3.0, 4.0]\n"motion.sigma_v" = [0.1]')
     sweep = load_sweep(path)

@@ -88,7 +88,7 @@ def equivalent(
     Parameters
     ----------
     below, above : p values of the ratio being as large as a number, or as small
-    ratio : that is estimated; without one above 0 there is no interval
+    ratio : the estimated one; the interval needs one above 0
     """
     p_value = below(factor)
     if not settings.one_sided:

@@ -30,11 +30,21 @@ def read_table_folder(folder: Path, r: Reading, poses_alone: bool = False) -> li
     """
     found = {}
     for run, file in enumerate(table_files(folder)):
-        of_run = r
-        if r.truth is not None:
-            of_run = replace(r, truth=paired(r.truth, file, "--truth", "table '{}'"))
-        found[run] = read_tables(file, of_run, poses_alone)
+        found[run] = read_table_of_run(file, r, poses_alone)
     return merged(found, folder.stem)
+
+
+def read_table_of_run(file: Path, r: Reading, poses_alone: bool = False) -> list[Estimator]:
+    """What a table of a folder holds, beside the truth of the same stem where the truth is a folder.
+
+    Raises
+    ------
+    InputError
+        It has no truth; as :func:`read_tables`.
+    """
+    if r.truth is not None:
+        r = replace(r, truth=paired(r.truth, file, "--truth", "table '{}'"))
+    return read_tables(file, r, poses_alone)
 
 
 def merged(

@@ -25,7 +25,7 @@ def plan(
     pilot_dof: int = 3,
     groups: int | None = None,
 ) -> dict[str, Any]:
-    """Runs that a verdict takes (``runs``), those of one chi-square test (``one_step``), and the first looks.
+    """Runs that a verdict takes (``runs``, 30 or more), those of one chi-square test (``one_step``), and first looks.
 
     Parameters
     ----------
@@ -43,6 +43,7 @@ def plan(
     from consistency.referee.diagnostics.planning.early_stopping import Design
     from consistency.referee.diagnostics.planning.pilot import pilot_plan
     from consistency.referee.diagnostics.statistics.number_of_runs import (
+        FEWEST_PLANNED,
         gate_runs,
         group_runs,
         lost_runs,
@@ -54,7 +55,7 @@ def plan(
     if pilots is not None and dof != pilot_dof:
         raise InputError(f"--dof {dof}: results of the bench have {pilot_dof} dimensions; leave it out")
     try:
-        runs = gate_runs(dof, detect, false_alarm, power, allow, lost)
+        runs = max(FEWEST_PLANNED, gate_runs(dof, detect, false_alarm, power, allow, lost))
         inspections = itertools.takewhile(lambda one: one[0] < runs, Design(dof).inspections())
         looks = [count for count, spent in inspections if spent]
         planned: dict[str, Any] = {

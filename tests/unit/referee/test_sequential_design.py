@@ -14,7 +14,7 @@ from scipy import integrate, stats
 from consistency.diagnostics import Design, Record, Verdict, e_process, ever, follow, judge, look, sequential_design
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
-from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
+from consistency.referee.diagnostics.questions.equivalence import equivalence, equivalence_by_betting
 from consistency.referee.diagnostics.statistics import nees as betting
 from consistency.referee.types import Failure
 
@@ -114,8 +114,33 @@ def test_consistent_is_said_at_looks_only():
     assert look(design, evidence, 0.05).status == "consistent"
     between = look(design, evidence, None)
     assert (between.status, between.later) == ("undecided", True)
-    assert between.reasons[0].startswith("undecided: no fault found in the scale; the other questions are asked at")
+    assert between.reasons[0].startswith("undecided: no fault found; an all-clear takes a look at all questions")
     assert between.faults == ()
+
+
+def test_an_all_clear_takes_thirty_runs():
+    """15 errors show their scale with 24 runs, but too few runs to show that hardly any has a wrong covariance."""
+    evidence_of = evidence_from(independent(np.random.default_rng(74), 48, 20, 15))
+    design = Design(15, false_alarm=SURE)
+    early = look(design, evidence_of(24), 1 / 6)
+    assert (early.status, early.later, early.faults) == ("undecided", True, ())
+    assert early.scale.equivalence.shown
+    assert "with 30 runs or more" in early.reasons[0]
+    assert look(design, evidence_of(30), 1 / 6).status == "consistent"
+    verdict, runs = follow(design, evidence_of, 48)
+    assert (verdict.status, runs) == ("consistent", 48)
+
+
+def test_an_all_clear_at_a_look_takes_the_test_of_its_runs_too():
+    """Two of 48 runs are wrong by x5: bets on the mean show it to be near 1, the test of unlike runs does not."""
+    means = np.where(np.arange(48) < 2, 5.0, 0.97)
+    evidence = Record("f", nees=np.broadcast_to(3.0 * means[:, None], (48, 20)), dof=3)
+    settings = Design(3).settings
+    assert equivalence_by_betting(means, 3, settings).shown
+    of_runs = equivalence(means, 3, 20, settings, is_whole=True)
+    assert not of_runs.shown
+    shown = findings_of(evidence, settings, Inspection(1 / 12, 1.0)).scale.equivalence
+    assert (shown.p_value, shown.interval) == (of_runs.p_value, of_runs.interval)
 
 
 def test_a_gross_fault_is_found_between_looks_too():

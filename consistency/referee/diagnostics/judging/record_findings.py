@@ -24,12 +24,14 @@ from consistency.referee.diagnostics.questions.equivalence import (
     equivalence_by_betting,
     equivalence_of_total,
     is_tolerated,
+    worst,
 )
 from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
 from consistency.referee.diagnostics.questions.sample import Sample, impossible_values, runs_and_steps, sample_of
 from consistency.referee.diagnostics.records.large_arrays import every_entry
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
+from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
 from consistency.referee.diagnostics.verdict.answers import (
     JOINT,
     MAIN,
@@ -145,7 +147,8 @@ def findings_of(
         status = truth.status(status, given_answers, settings)
         parts = _parts_of_estimate(truth, parts, given_answers, settings)
     unshown, status, scale = withheld(unshown, status, parts.scale)
-    later = status == "consistent" and inspection is not None and inspection.spent is None
+    is_early = inspection is not None and (inspection.spent is None or runs < FEWEST_PLANNED)
+    later = status == "consistent" and is_early
     if later:
         status = "undecided"
     return Findings(
@@ -243,16 +246,20 @@ def _tolerated(joint: JointTest | None, innovations: Innovations | None, setting
 def _equivalence(
     sample: Sample, settings: Settings, inspection: Inspection | None, record: Record, truth: UncertainTruth | None
 ) -> Equivalence:
-    """Whether the ratio of true to stated covariance is shown to lie where it should."""
-    if inspection is not None:
-        return equivalence_by_betting(sample.means(), sample.dof, settings)
+    """Whether the ratio of true to stated covariance is shown to lie where it should.
+
+    At a look both tests must show it: the e-process is valid at any look, but shows the mean of unlike runs too soon.
+    """
     factor = max(settings.factor, settings.tolerated)
     if truth is not None:
         return truth.equivalence(sample, settings, factor)
     low_is_fault = not record.reduced
-    return equivalence(
+    shown = equivalence(
         sample.means(), sample.dof, sample.longest, settings, factor, low_is_fault, record.unseen, is_whole=True
     )
+    if inspection is None:
+        return shown
+    return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings)))
 
 
 def _early_ends(sample: Sample) -> EarlyEnds | None:

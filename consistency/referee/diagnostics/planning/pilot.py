@@ -9,6 +9,7 @@ import numpy as np
 from consistency.referee.defaults import FALSE_ALARM, POWER
 from consistency.referee.diagnostics.questions.scale import FEW, scale_test
 from consistency.referee.diagnostics.statistics.number_of_runs import (
+    FEWEST_PLANNED,
     gate_runs,
     lost_runs,
     require_rates,
@@ -43,8 +44,8 @@ def pilot_plan(
     """Runs that :func:`judge` needs if steps depend on each other as in a pilot, and not completely.
 
     :func:`gate_runs` at the pilot's effective degrees of freedom, one standard error to the safe side, times 1.15: a
-    verdict estimates them again from its own runs. At least 20 runs, as it needs for that. Scale and bias of the pilot
-    do not matter, only the spread of its run means.
+    verdict estimates them again from its own runs. At least 30 runs, since fewer miss too easily that the covariance
+    is wrong in a few of them. Scale and bias of the pilot do not matter, only the spread of its run means.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def pilot_plan(
     test = scale_test(means / means.mean(), dof, steps)
     share = SHARES[MAIN] * false_alarm
     least = required_runs(test.effective_dof, detect, share, power, two_sided=allow is None)
-    runs = max(FEW, min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow)))
+    runs = max(FEWEST_PLANNED, min(int(np.ceil(MARGIN * least)), gate_runs(dof, detect, false_alarm, power, allow)))
     if lost is not None:
         runs = max(runs, lost_runs(lost, power))
     return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), runs)

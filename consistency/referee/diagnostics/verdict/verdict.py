@@ -74,7 +74,7 @@ class Findings:
     truth: TruthShare | None = None  # where the truth has a covariance of its own
     parts: Mapping[str, Findings] = field(default_factory=dict)  # where cross terms between them are not stated
     unshown: str = ""  # why nothing can be shown, so that nothing is decided
-    later: bool = False  # nothing is decided at this look, which asks the scale alone and found no fault in it
+    later: bool = False  # this look found no fault; it asks the scale alone, or has too few runs for an all-clear
 
     @property
     def consistent(self) -> bool:

@@ -10,6 +10,7 @@ from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.questions.sample import ATTITUDE
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
 from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
 from consistency.referee.diagnostics.verdict.parts import (
     ByGroup,
@@ -48,7 +49,7 @@ def reasons(v: Findings) -> list[str]:
     lines += [*details(v), *_first_steps(v)]
     first = lines[0]
     if v.later:
-        first = "no fault found in the scale; the other questions are asked at the next look"
+        first = f"no fault found; an all-clear takes a look at all questions with {FEWEST_PLANNED} {v.unit}s or more"
     elif v.unshown:
         first = _unshown_sentence(v)
     elif v.skipped is not None:
@@ -232,15 +233,16 @@ def _lost(v: Findings) -> str:
         text = f"; {some}, and"
     elif asked is not None:
         text = ", but"
-    digits = 3
     if asked is None:
-        digits = 2
-    text += f" lost {unit}s of up to {percent(lost.upper, digits)} cannot be excluded with {plural(v.runs, unit)}"
+        digits, may = 2, "be lost or have a wrong covariance"
+    else:
+        digits, may = 3, "be lost"
+    text += f" up to {percent(lost.upper, digits)} of {unit}s may still {may}"
     if asked is None:
         return text
     text += f", and {percent(asked)} is asked for"
     if lost.needed is not None:
-        text += f"; {lost.needed} {unit}s would, if no further one is lost"
+        text += f"; {lost.needed} {unit}s would show it, if no further one is lost"
     return text
 
 

@@ -9,6 +9,7 @@ from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import MOST, SIDE, names_in_a_row, off_by
 
 BLOCKS = ("position", "attitude", "velocity")
+NEAR = 1.3  # ratio of each axis of a block that is called right: with more, an axis wrong by 1.5 hides in it too often
 
 
 def ratios_of_blocks(axes: ComponentRatios) -> dict[str, Interval]:
@@ -33,6 +34,14 @@ def members_of(axes: ComponentRatios, block: str) -> list[str]:
 def are_alike(intervals: list[Interval]) -> bool:
     """Whether some factor lies in all of the intervals."""
     return max(interval.low for interval in intervals) <= min(interval.high for interval in intervals)
+
+
+def is_right(v: Findings, name: str, ratio: Interval) -> bool:
+    """Whether an axis or block is shown to lie within ``--detect``, and each of its axes may be right and is near 1."""
+    assert v.axes is not None
+    ratios = [v.axes.inflation[each] for each in (name, *members_of(v.axes, name))]
+    are_near = all(each.holds(1.0) and 1.0 / NEAR <= each.value <= NEAR for each in ratios)
+    return are_near and 1.0 / v.settings.factor <= ratio.low and ratio.high <= v.settings.factor
 
 
 def unlike_ratios(v: Findings) -> dict[str, Interval]:
@@ -67,8 +76,7 @@ def unlike_text(v: Findings) -> str:
         texts.append(f"{name} {size.removeprefix(side).lstrip()}")  # the side once: x too small by ..., y by ...
         side = size[:SIDE]
     others = {name: ratio for name, ratio in ratios_of_blocks(v.axes).items() if name not in off}
-    factor = v.settings.factor
-    right = [name for name, ratio in others.items() if 1.0 / factor <= ratio.low and ratio.high <= factor]
+    right = [name for name, ratio in others.items() if is_right(v, name, ratio)]
     if len(right) > MOST and len(right) == len(others):
         texts.append("the others right")
     elif 1 <= len(right) <= MOST:

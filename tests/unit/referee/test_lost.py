@@ -24,6 +24,7 @@ from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, l
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
 from consistency.referee.gating.gate_terms import RunningTest, watching
 from consistency.referee.types import Failure
+from consistency.referee.verdicts.planned_runs import plan
 from consistency.testing import InsufficientTrials, assert_consistent
 
 SURE = 1e-5
@@ -75,6 +76,12 @@ def test_plans_have_at_least_these_runs():
     assert gate_runs(3, 1.2, lost=0.05) == gate_runs(3, 1.2)
     means = np.linspace(0.9, 1.1, 40)
     assert pilot_plan(means, 3, 100, 2.0, lost=0.05).runs == 59 > pilot_plan(means, 3, 100, 2.0).runs
+
+
+def test_a_plan_has_thirty_runs_and_a_gate_what_its_scale_takes():
+    assert plan(15, 1.5, 0.05, 0.95)["runs"] == 30 > gate_runs(15, 1.5) == 13
+    assert plan(3, 1.5, 0.05, 0.95)["runs"] == gate_runs(3, 1.5) == 61
+    assert pilot_plan(np.linspace(0.99, 1.01, 40), 15, 100, 2.0).runs == 30
 
 
 def test_a_share_out_of_range_is_refused():

@@ -240,6 +240,24 @@ def test_an_axis_is_right_if_it_is_shown_to_be():
     assert unlike_text(of(many | {"e": (1.0, 0.5, 2.0)})) == "x too small by x2.00 [1.80, 2.20]"
 
 
+@pytest.mark.parametrize(
+    "yaw, right",
+    [
+        (RIGHT, True),
+        ((1.29, 0.9, 1.9), True),
+        ((1.31, 0.9, 1.9), False),
+        ((1 / 1.29, 0.5, 1.1), True),
+        ((1 / 1.31, 0.5, 1.1), False),
+        ((1.2, 1.01, 1.4), False),
+        ((0.85, 0.7, 0.99), False),
+    ],
+)
+def test_a_block_is_right_if_each_of_its_axes_may_be_and_is_near_one(yaw, right):
+    ratios = {"x": FAR, "y": FAR, "z": FAR, "position": FAR, "roll": RIGHT, "pitch": RIGHT, "yaw": yaw}
+    text = unlike_text(of(ratios | {"attitude": (1.05, 0.85, 1.25)}))
+    assert text == "position too small by x2.00 [1.80, 2.20]" + ", attitude right" * right
+
+
 def test_nothing_in_a_conservative_covariance_has_to_grow():
     ratios = {"x": (0.4, 0.35, 0.45), "y": FAR}
     assert unlike_text(of(ratios, "conservative")) == "x too large by x2.50 [2.22, 2.86] (ratio 0.40)"

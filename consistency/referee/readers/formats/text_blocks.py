@@ -69,8 +69,8 @@ class Block:
         begins = np.flatnonzero(inside & ~np.append(False, inside[:-1]))
         if not width or not len(ends) or len(begins) != width * len(ends) or b";" in data:
             return None
-        begins = begins.reshape(-1, width)
-        if (begins[:, -1] > ends).any() or (begins[1:, 0] < ends[:-1]).any():
+        of_lines = begins.reshape(-1, width)
+        if (of_lines[:, -1] > ends).any() or (of_lines[1:, 0] < ends[:-1]).any():
             return None
         with warnings.catch_warnings():
             warnings.simplefilter("error")

@@ -26,6 +26,9 @@ class Command(threading.Thread):
 
     def run(self) -> None:
         gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(AttributeError):  # of a stream that is closed
+                stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # of a locale without Unicode
         from consistency.commands import main  # slow to load
 
         try:
@@ -37,10 +40,10 @@ class Command(threading.Thread):
 def main() -> NoReturn:
     """Run the command line until it ends, or until Ctrl-C does; SIGTERM and SIGHUP end the process by themselves.
 
-    Where programs are run, they end them, too.
+    Where programs are run, they end them, too; what a report has half written is removed before.
     """
     signals = [signal.SIGINT]
-    if sys.argv[1:2] == ["monte-carlo"]:
+    if sys.argv[1:2] in (["monte-carlo"], ["analyse"], ["report"]):
         signals += [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
     for number in signals:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as of nohup, and of & in a script
@@ -56,6 +59,9 @@ def _stop(number: int, _: Any = None) -> NoReturn:
     """Say so in one line and end at once; an exception would be swallowed by serialisers and compilers."""
     for end in getattr(sys.modules.get("consistency.referee.system.stopping"), "AT_STOP", ()):
         end()
+    if number != signal.SIGINT and sys.argv[1:2] != ["monte-carlo"]:  # as it would have ended by itself
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
     line = "consistency: stopped"
     if sys.argv[1:2] in (["run"], ["sweep"]):
         line += GOES_ON

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 import traceback
@@ -13,10 +12,10 @@ import typer
 from consistency.commands.registry import HELP, CommandGroup
 from consistency.referee.errors import InputError
 from consistency.referee.extras import explained
+from consistency.referee.system.atomic import FULL
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 Abort: Any = typer.Abort
-FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 
 app = typer.Typer(
     cls=CommandGroup,

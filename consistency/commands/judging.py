@@ -35,6 +35,7 @@ from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import Reading
 
 if TYPE_CHECKING:
+    from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.verdicts.judge_sources import Source
 
 
@@ -101,6 +102,7 @@ def analyse_command(
     )
     settings, first = settings_of(**changes) if changes else None, skip_asked(skip)
     written: list[Path] = []
+    recordings: list[Record] = []
     refused: InputError | None = None  # of a report, said below the verdict
     is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
     require_written(overwrite, report, "--report")
@@ -114,17 +116,6 @@ def analyse_command(
         verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
         _refuse_unfinished(path, source, "monte-carlo", fail_on)
-        if report is not None and not is_file:
-            from consistency.referee.pages.write_pages import write_file_reports
-            from consistency.referee.show.as_json import render
-
-            try:
-                data = render(document(verdicts))
-                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
-                if missing("report"):
-                    print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
-            except InputError as error:
-                refused = error
     else:
         from consistency.bench.runs.results_to_records import results_source
 
@@ -138,14 +129,25 @@ def analyse_command(
         verdicts = judge_all(results, filters, settings=settings, skip=first)
         _refuse_unfinished(path, results, "run", fail_on)
     shown = document(verdicts, path.name, verbose=verbose)
-    if report is not None and is_file:
-        from consistency.referee.pages.write_pages import write_text_file
+    print_document(shown, as_json)
+    sys.stdout.flush()  # whatever becomes of the pictures
+    if report is not None:
+        from consistency.referee.pages.write_pages import write_file_reports, write_text_file
+        from consistency.referee.show.as_json import render
 
         try:
-            written = [write_text_file(shown, report)]
+            if is_file:
+                written = [write_text_file(shown, report)]
+            else:
+                data = render(document(verdicts))
+                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
+                if missing("report"):
+                    print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
         except InputError as error:
             refused = error
-    print_document(shown, as_json, written)
+    if not as_json:
+        for file in written:
+            print(file)
     is_failed = fail_on is not None and not all(verdict.consistent for verdict in verdicts.values())
     if refused is not None and not is_failed:
         raise refused

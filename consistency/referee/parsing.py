@@ -25,6 +25,7 @@ _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""  # its possessive quantifiers n
 UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # categories of Unicode: control, surrogate, ends of lines and paragraphs
 PROGRAMMING = (NameError, TypeError, AttributeError, IndexError)  # of others what a file holds may be the cause
 PACKAGE = Path(__file__).parents[1]
+TURNING = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}  # what follows is shown in another order
 _SHOWN = 160  # characters of a parser's own words
 
 
@@ -80,14 +81,17 @@ def one_line(value: object, longest: int = _SHOWN) -> str:
 
 
 def require_name(name: str, where: str) -> str:
-    """A name of something, as it is, which can be printed: on one line, and to a terminal.
+    """A name of something, as it is, which can be printed: on one line, in its order, and to a terminal.
 
     Raises
     ------
     InputError
-        It has a line break or another control character.
+        It has a line break or another control character, also one that turns the direction of text (U+202E).
     """
-    if any(unicodedata.category(char) in UNPRINTABLE for char in name):
+    if any("\udc80" <= char <= "\udcff" for char in name):  # bytes that the locale does not know
+        locale = "set PYTHONUTF8=1 or a UTF-8 locale such as LC_ALL=C.UTF-8"
+        raise InputError(f"{where}: the name {one_line(ascii(name), 60)} is not text in this locale; {locale}")
+    if any(unicodedata.category(char) in UNPRINTABLE or unicodedata.bidirectional(char) in TURNING for char in name):
         raise InputError(f"{where}: the name {one_line(ascii(name), 60)} has a control character; rename it")
     return name
 

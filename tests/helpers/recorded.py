@@ -5,4 +5,4 @@ from consistency.referee.readers.pipeline import read_files
 
 
 def read_recordings(estimates, truth=None, covariance=None, error=None, **options):
-    return read_files.read_recordings(estimates, Reading(truth, covariance, error, **options))
+    return read_files.read_recordings(estimates, Reading(truth=truth, covariance=covariance, error=error, **options))

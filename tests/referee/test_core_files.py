@@ -70,7 +70,7 @@ def test_an_estimate_that_is_not_finite_is_a_failed_run(column, value, tmp_path)
     cells[header.split(",").index(column)] = value
     lines[8] = ",".join(cells)
     path.write_text("\n".join([header, *lines]))
-    [recording] = read_recordings(path, Reading(tmp_path / "truth.csv"))
+    [recording] = read_recordings(path, Reading(truth=tmp_path / "truth.csv"))
     [failure] = recording.failures
     assert (failure.run, failure.step) == (1, 3)
     assert failure.reason.startswith("estimate is not finite")

@@ -150,7 +150,7 @@ class SweepFolder:
         if replace(sweep_before, filters=()) == replace(self.sweep, filters=()):
             self.sweep = replace(self.sweep, filters=tuple(dict.fromkeys((*sweep_before.filters, *self.sweep.filters))))
         text = json.dumps(manifest | {"sweep": describe(self.sweep), "tables": []}, indent=2)
-        write_whole(self.path / "manifest.json", f"{text}\n".encode(), 0o644)
+        write_whole(self.path / "manifest.json", f"{text}\n".encode())
 
     @contextmanager
     def at_work(self, work: CellWork) -> Iterator[Journal]:

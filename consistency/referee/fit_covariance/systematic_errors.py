@@ -143,7 +143,8 @@ def choose_mean(
     strength = _strength(equations[NEIGHBOURS])
     lasts = _lasts(neighbours.mean.applied(windows))
     range_of_both = np.maximum(forward.high, backward.high) - np.minimum(forward.low, backward.low)
-    gain = np.log(range_of_both / (neighbours.high - neighbours.low))[:SCALES].sum()
+    with np.errstate(divide="ignore", invalid="ignore"):  # of motions without an error
+        gain = np.log(range_of_both / (neighbours.high - neighbours.low))[:SCALES].sum()
     are_instruments = strength >= STRONG and not lasts and gain > 0
     used = [NEIGHBOURS] if are_instruments else [FORWARD, BACKWARD]
     mean, low, high, free = _select(windows, near, [equations[each] for each in used])

@@ -103,10 +103,13 @@ def read(
     stated = None if covariance is None else Path(covariance)
     of_truth = None if truth_covariance is None else str(truth_covariance)
     reading = Reading(
-        true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
-        motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
-        truth_shared or None, by, None if by_file is None else Path(by_file), bins, columns, truth_columns, world,
-        body_axes, truth_world, truth_body_axes,
+        truth=true, covariance=stated, error=error, state=state, covariance_order=covariance_order, max_dt=max_dt,
+        time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
+        motions=motions or None, windows=windows, align=align, lever_arm=lever_arm, split=split,
+        truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
+        by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
+        columns=columns, truth_columns=truth_columns,
+        world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

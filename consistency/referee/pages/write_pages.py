@@ -210,6 +210,6 @@ def require_writable(path: Path, overwrite: bool) -> None:
 def write_file(path: Path, content: bytes) -> None:
     """A file, whole or not at all; raises :class:`InputError` where the system refuses."""
     try:
-        write_whole(path, content, 0o644)
+        write_whole(path, content)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import threading
@@ -12,12 +14,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from consistency.referee.errors import InputError
 from consistency.referee.programs.words import Program
 from consistency.referee.readers.pipeline.program_runs import LOG, RUN_FILE, RUN_KIND, ProgramRun, filled
+from consistency.referee.system.atomic import FULL
 from consistency.referee.system.stopping import AT_STOP
 
 Process = subprocess.Popen[bytes]
 TAIL = 16384  # bytes of a log that are kept where a program has deleted it
+LEAST_FREE = 2**16  # bytes of a disk, below which it counts as full
 VARIABLES = ("run", "seed", "out", "here", "worker", "input", "name")
 
 
@@ -93,7 +98,31 @@ def run_program(
     ------
     Stopped
         The study stopped meanwhile.
+    InputError
+        The disk is full: the run is not finished, whatever the program left.
     """
+    try:
+        done = _done(program, folder, run, values, timeout, processes)
+        if shutil.disk_usage(folder).free < LEAST_FREE:  # a file of the program may be cut short
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        finish(done)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        what = f"the disk is full ({error.strerror}), and run {run} does not count"
+        raise InputError(f"{folder}: {what}; free some space, then the same command with --resume continues") from None
+    return done
+
+
+def _done(
+    program: Program,
+    folder: Path,
+    run: int,
+    values: Mapping[str, str],
+    timeout: float | None,
+    processes: Processes,
+) -> ProgramRun:
+    """Do one run as :func:`run_program`, without its ``run.json``."""
     folder.mkdir(parents=True)
     words = [filled(word, values) for word in program.words]
     env = {**os.environ, **{f"CONSISTENCY_{name.upper()}": values[name] for name in VARIABLES if name in values}}
@@ -106,9 +135,7 @@ def run_program(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / LOG).write_bytes(tail)
         failure = failure or "the program deleted its folder"
-    done = ProgramRun(folder, run, dict(values), failure, round(time.monotonic() - started, 3))
-    finish(done)
-    return done
+    return ProgramRun(folder, run, dict(values), failure, round(time.monotonic() - started, 3))
 
 
 def finish(run: ProgramRun) -> None:

@@ -68,7 +68,7 @@ def _option(
     return field(default=None, metadata={"help": help, "metavar": metavar, "parse": parse, "flag": flag})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.valid_covariances import ROUNDED
 from consistency.referee.geometry import wrap
 from consistency.referee.geometry.conventions import planar_error
 from consistency.referee.readers.places import Places
@@ -144,10 +145,13 @@ def _bends(position: Array, after: Indices) -> Array:
     last = len(position) - 2  # the last sample with a second difference
     if last < 1:
         return np.zeros(len(after))
-    second = np.linalg.norm(np.diff(position, 2, axis=0), axis=1)  # of samples 1, 2, ...
-    before = second[np.clip(after, 1, last) - 1]
-    behind = second[np.clip(after + 1, 1, last) - 1]
-    return np.asarray(np.maximum(before, behind) / 8.0)
+
+    def second(sample: Indices) -> Array:
+        k = np.clip(sample, 1, last)
+        difference = (position[k + 1] - position[k]) - (position[k] - position[k - 1])
+        return np.asarray(np.linalg.norm(difference, axis=1))
+
+    return np.asarray(np.maximum(second(after), second(after + 1)) / 8.0)
 
 
 OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend")
@@ -264,9 +268,16 @@ class Poses:
         return replace(self, t=self.t + shift)
 
     def sound(self) -> Poses:
-        """Estimates that are finite, with a finite covariance."""
+        """Estimates that are finite, with a finite covariance, in which a variance that counts as none is 0."""
         finite = finite_rows(self.estimate) & finite_rows(self.covariance)
-        return self.of_rows(np.flatnonzero(finite))
+        found = self.of_rows(np.flatnonzero(finite))
+        none = np.abs(found.variances) <= ROUNDED.zero
+        if not found.variances[none].any():
+            return found
+        P = found.covariance.copy()
+        row, component = np.nonzero(none)
+        P[row, component, component] = 0.0
+        return replace(found, covariance=P)
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""

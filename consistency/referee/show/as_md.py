@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 from consistency.referee.diagnostics.words.numbers import with_subject
 from consistency.referee.document.blocks import Block, Bullets, Cell, Document, Facts, Heading, Reasons, Table, Text
 from consistency.referee.document.wording import PLAIN, written
 
+MARKUP = re.compile(r"[*]|(?<!\w)_|_(?!\w)|~(?=~)|\[(?![-+.\d][^\]]*\](?!\())|(?<=\])\(")  # but intervals: [1.4, 2.0]
 ESCAPED = (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"))
 
 
@@ -46,4 +49,4 @@ def _line(text: str) -> str:
     text = " ".join("".join(char if char.isprintable() else " " for char in text).split())
     for char, escaped in ESCAPED:
         text = text.replace(char, escaped)
-    return text
+    return MARKUP.sub(r"\\\g<0>", text)

@@ -6,10 +6,15 @@ hides it on a page. Matplotlib is loaded when the first figure is drawn.
 
 from __future__ import annotations
 
+import logging
+import os
 import re
+import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from itertools import pairwise
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,6 +42,37 @@ RC: Any = {
     "legend.frameon": False, "legend.handlelength": 2.6, "legend.columnspacing": 1.4, "legend.borderaxespad": 0.1,
     "text.parse_math": False, "svg.fonttype": "none", "path.simplify": True,
 }  # fmt: skip
+
+
+@contextmanager
+def own_style(**more: Any) -> Iterator[None]:
+    """Draw in the style of the reports and with ``more`` parameters, whatever the user has set for other figures."""
+    mpl = _matplotlib()
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(RC | more)
+        yield
+
+
+def _matplotlib() -> ModuleType:
+    """Import Matplotlib, though the user's files or ``MPLBACKEND`` name what is not there; reports need no backend."""
+    if "matplotlib" in sys.modules:
+        return sys.modules["matplotlib"]
+    backend = os.environ.get("MPLBACKEND")
+    disabled = logging.root.manager.disable
+    try:
+        logging.disable(logging.CRITICAL)  # what Matplotlib says of a matplotlibrc
+        if backend is not None:
+            os.environ["MPLBACKEND"] = "agg"
+        import matplotlib as mpl
+    finally:
+        logging.disable(disabled)
+        if backend is not None:
+            os.environ["MPLBACKEND"] = backend
+    if backend:
+        with suppress(ValueError):
+            mpl.rcParams["backend"] = backend
+    return mpl
 
 
 def canvas(

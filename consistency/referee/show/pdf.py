@@ -17,6 +17,7 @@ import typst
 from consistency.referee.document import blocks
 from consistency.referee.document.wording import unbroken, written
 from consistency.referee.show.svg import Pictures, paint
+from consistency.referee.system.stopping import AT_STOP, remove_at_stop
 
 TEMPLATE = "report.typ"
 FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"  # those of the figures, whose text stays text
@@ -32,6 +33,7 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
     """
     with tempfile.TemporaryDirectory(prefix="consistency-report-") as name:
         folder = Path(name)
+        removal = remove_at_stop(folder)
         paper = Paper(folder, paint(document) if pictures is None else pictures)
         data = {part: paper.plain(getattr(document, part)) for part in ("title", "answer", "opening")}
         data["chapters"] = paper.plain(document.paper)
@@ -41,6 +43,7 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
         pdf: bytes = typst.compile(
             str(folder / TEMPLATE), root=str(folder), ignore_system_fonts=True, font_paths=[str(FONTS)]
         )
+        AT_STOP.remove(removal)
         return pdf
 
 

@@ -11,7 +11,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from consistency.referee.document.blocks import Document
-from consistency.referee.show.matplotlib_style import FILTER, RC, TITLE, WIDTH
+from consistency.referee.show.matplotlib_style import FILTER, TITLE, WIDTH, own_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,10 +57,9 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
     ----------
     name : tells what the drawing refers to from that of the other drawings of a page
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    with own_style():
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    with mpl.rc_context(RC):
         figure = draw()
         # laid out here and not by savefig, which draws everything once more for that
         figure.set_dpi(POINTS)
@@ -81,22 +80,18 @@ def png(draw: Callable[[], Figure], resolution: int = 200) -> bytes:
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
     """A drawing in the style of the reports, as a figure of Matplotlib."""
-    import matplotlib as mpl
-
-    with mpl.rc_context(RC):
+    with own_style():
         return draw()
 
 
 def saved(figure: Figure, kind: str, resolution: int = 200, name: str = "figure") -> bytes:
     """A figure as PNG, PDF or SVG, without date and software; ``name`` is that of :func:`svg`."""
-    import matplotlib as mpl
-
     without: dict[str, dict[str, None]] = {
         "png": {"Software": None}, "pdf": {"CreationDate": None},
         "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
     }  # fmt: skip
     buffer = BytesIO()
-    with warnings.catch_warnings(), mpl.rc_context(RC | {"svg.hashsalt": name}):
+    with warnings.catch_warnings(), own_style(**{"svg.hashsalt": name}):
         # a name in a script that the font lacks is drawn as boxes; the tables of the page show it
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure.savefig(buffer, format=kind, dpi=resolution, metadata=without[kind])

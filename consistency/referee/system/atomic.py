@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import platform
@@ -9,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+FULL = {errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.ENOSPC)}  # a disk, a quota, a limit
 PARTIAL = ".partial"  # at the end of the name of what is being written
 
 
@@ -23,15 +25,18 @@ def write_whole(path: Path, content: bytes, mode: int | None = None) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        if mode is None:
-            mask = os.umask(0)
-            os.umask(mask)
-            mode = 0o666 & ~mask
-        partial.chmod(mode)
+        partial.chmod(0o666 & ~umask() if mode is None else mode)
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def umask() -> int:
+    """Permissions that the user takes from what is written."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def partial_folder(path: Path, above: Path) -> Path:

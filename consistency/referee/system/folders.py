@@ -13,8 +13,9 @@ from typing import Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, read_json
-from consistency.referee.system.atomic import left_beside, make_durable, partial_folder
+from consistency.referee.system.atomic import left_beside, make_durable, partial_folder, umask
 from consistency.referee.system.provenance import SCHEMA_VERSION
+from consistency.referee.system.stopping import AT_STOP, remove_at_stop
 
 IN_PYTHON = "(overwrite=True in Python)"
 
@@ -67,7 +68,7 @@ def writing(folder: Path, option: str = "--out") -> Iterator[None]:
 
 
 def _above(folder: Path) -> Path:
-    return next(parent for parent in folder.absolute().parents if parent.exists())
+    return next((parent for parent in folder.absolute().parents if parent.exists()), folder)  # itself: the root
 
 
 class NewFolder:
@@ -89,17 +90,21 @@ class NewFolder:
         self.keep_others = keep_others
         self.within = within
         self.is_placed = False
+        self._removal: Callable[[], None] | None = None
         if within is not None:
             self.path = within / "tables"
             shutil.rmtree(self.path, ignore_errors=True)  # of a process that was ended
             return
         with self.writing():
             self.path = partial_folder(folder, _above(folder))
+        self._removal = remove_at_stop(self.path)
 
     def __enter__(self) -> NewFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._removal in AT_STOP:
+            AT_STOP.remove(self._removal)
         shutil.rmtree(self.path, ignore_errors=True)
 
     @contextmanager
@@ -119,7 +124,7 @@ class NewFolder:
         """
         with self.writing():
             (self.path / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-            self.path.chmod(0o755)
+            self.path.chmod(0o777 & ~umask())
             for path in (*self.path.iterdir(), self.path):
                 make_durable(path)
             self.folder.parent.mkdir(parents=True, exist_ok=True)

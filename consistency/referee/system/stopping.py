@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shutil
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
 IS_LINUX = sys.platform == "linux"
 AT_STOP: list[Callable[[], None]] = []  # what is to be ended before a signal ends this process
+WRITERS = 3  # times that a folder is removed, as a thread may be writing into it
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+def remove_at_stop(folder: Path) -> Callable[[], None]:
+    """Have a half-written folder removed where a signal ends this process; return what ``AT_STOP`` has for it."""
+
+    def remove() -> None:
+        for _ in range(WRITERS):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    AT_STOP.append(remove)
+    return remove
 
 
 def away_from_signals(call: Callable[..., Result], *args: Any) -> Result:

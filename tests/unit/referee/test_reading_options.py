@@ -13,6 +13,7 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.diagnostics import Record
+from consistency.referee.notebook import read_and_judge
 from consistency.referee.readers.options import MAX_DT, Reading, flag_of
 from consistency.referee.readers.pipeline.read_files import own_names
 from consistency.testing import assert_consistent
@@ -21,6 +22,17 @@ from consistency.testing import assert_consistent
 def test_python_has_every_option_of_files():
     names = list(inspect.signature(cs.read).parameters)
     assert names == ["estimates", *(each.name for each in fields(Reading)), "filter"]
+
+
+def test_each_option_of_python_reaches_the_readers_under_its_name(monkeypatch):
+    given = {each.name: f"the {each.name}" for each in fields(Reading)}
+    seen = []
+    monkeypatch.setattr(read_and_judge, "read_recordings", lambda path, reading: [seen.append(reading)])
+    with pytest.raises(AttributeError):  # of a record that is None
+        cs.read("est.csv", **given)
+    assert {name: str(getattr(seen[0], name)) for name in given} == given
+    with pytest.raises(TypeError, match="positional"):
+        Reading("truth.csv")
 
 
 def test_what_follows_from_options():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numba
@@ -115,7 +117,7 @@ class Kernel:
 
     def _compiled(self, entry: Any, signature: tuple[Any, ...], content: Content) -> Any:
         names = {self.function.__qualname__, *content.dispatchers}
-        with one_program(names):
+        with one_program(names), without_collection():
             entry.compile(signature)
         return entry
 
@@ -130,6 +132,18 @@ class Kernel:
             entry.add_overload(result)
         self.loaded += 1
         return True
+
+
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Turn garbage collection off for a while: most of what a compiler makes lives until it is done."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def _signature(args: tuple[Any, ...]) -> tuple[Any, ...]:

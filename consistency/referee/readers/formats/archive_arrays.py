@@ -36,9 +36,11 @@ def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
     with path.open("rb") as file:
         what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
     refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
-    with reading(path, refusal), np.load(path, allow_pickle=False) as archive:
-        if not hasattr(archive, "files"):
-            raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+    with reading(path, refusal):
+        loaded = np.load(path, allow_pickle=False)
+    if not hasattr(loaded, "files"):
+        raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+    with reading(path, refusal), loaded as archive:
         if len(set(archive.files)) < len(archive.files):
             raise ValueError("a key is duplicated")
         require_room(path, sum(member.file_size for member in archive.zip.infolist()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
 ARCHIVES = (".npz", ".mat")
 TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
+PARTNERS = (*sorted(TRAJECTORIES), ".csv", ".pos", *TABLES)  # of a file of the same stem, the first that is there
 HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
 
 
@@ -91,8 +93,8 @@ def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[
     files = trajectory_files(estimates, r.columns)
     if not files:
         raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
-    stems = [path.stem for path in files]
-    if twice := next((stem for stem in stems if stems.count(stem) > 1), None):
+    twice, count = Counter(path.stem for path in files).most_common(1)[0]
+    if count > 1:
         raise InputError(f"{estimates}: holds the run '{twice}' twice, as .txt and .tum; keep one of them")
     if covariance is not None and not covariance.is_dir():
         raise InputError(f"--covariance {covariance}: must be a folder like {estimates}, a file for each run")
@@ -120,11 +122,10 @@ def paired(other: Path, path: Path, option: str, kind: str = "file '{}' with .tx
         return other
     if is_drive(other / path.stem):
         return other / path.stem
-    for file in (*trajectory_files(other), *table_files(other)):
-        if file.stem == path.stem:
+    for suffix in (*PARTNERS, *map(str.upper, PARTNERS), path.suffix):  # a folder of thousands is not listed each time
+        file = other / f"{path.stem}{suffix}"
+        if file.is_file():
             return file
-    if (other / path.name).is_file():
-        return other / path.name
     what = f"holds no {kind.format(path.stem)} for {path}"
     raise InputError(f"{option} {other}: {what}; files of the two folders are paired by name")
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, keys_once, one
 from consistency.referee.readers.formats.file_head import Head
 from consistency.referee.readers.formats.spellings import Columns, renamed
 from consistency.referee.readers.formats.text_blocks import (
+    Block,
     FileRows,
     LineParser,
     bounded,
@@ -202,7 +204,7 @@ def frame_rows(frame: Any, name: str) -> TableRows:
 
 def require_distinct(names: Sequence[str], where: Path | str) -> None:
     """Refuse names of columns of which two are the same."""
-    twice = sorted(name for name in names if names.count(name) > 1)
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InputError(f"{where}: column '{twice[0]}' is duplicated")
 
@@ -234,6 +236,12 @@ class CsvTable(LineParser):
     names: Sequence[str] = ()
     separator = ","
     plain = True  # no field of the block is a number in Python alone
+
+    def at_once(self, block: Block) -> dict[str, Column] | None:
+        if "filter" in self.names:
+            return None
+        values = block.numbers(len(self.names), self.separator)
+        return None if values is None else dict(zip(self.names, values.T, strict=True))
 
     def row(self, number: int, line: str) -> list[str] | None:
         """Fields of a line, out of quotes where some are in them."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import gzip
 import itertools
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
@@ -20,15 +22,63 @@ from consistency.referee.types import Array, Indices
 BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as much
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
+PLAIN = b"0123456789+-.eE ,;\t\n"  # characters of numbers, and between them
 WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and a character of ASCII
 
 
-class Block(NamedTuple):
+@dataclass(frozen=True)
+class Block:
     """Whole lines of a text file."""
 
-    rows: list[str]
+    path: Path
+    data: bytes
     first: int  # number of the first one in the file, from 1
     ends: bool  # the last one has an end; otherwise it is the last line of the file alone
+
+    @cached_property
+    def rows(self) -> list[str]:
+        """The lines, without their ends."""
+        with reading(self.path, REFUSAL):
+            return self.data.decode("utf-8").splitlines()
+
+    @cached_property
+    def plain(self) -> bytes:
+        """The same bytes with ends of one character, if they spell finite decimal numbers; none otherwise."""
+        data = self.data.replace(b"\r\n", b"\n")
+        return b"" if data.translate(None, PLAIN) else data
+
+    @property
+    def count(self) -> int:
+        """Number of lines."""
+        return self.plain.count(b"\n") if self.plain else len(self.rows)
+
+    def numbers(self, width: int, separator: str = "") -> Array | None:
+        """The numbers of all lines at once, (lines, width), to the last bit as Python reads each.
+
+        None where a line does not hold ``width`` of them, apart by one ``separator``, or by white space and commas.
+        """
+        data = self.plain if self.ends else b""
+        if separator:
+            others = b" \t,;".replace(separator.encode(), b"")
+            if data.count(separator.encode()) != (width - 1) * self.count or data.translate(None, others) != data:
+                return None
+        data = data.replace((separator or ",").encode(), b" ")
+        codes = np.frombuffer(data, np.uint8)
+        ends = np.flatnonzero(codes == ord("\n"))
+        inside = codes > ord(" ")
+        begins = np.flatnonzero(inside & ~np.append(False, inside[:-1]))
+        if not width or not len(ends) or len(begins) != width * len(ends) or b";" in data:
+            return None
+        of_lines = begins.reshape(-1, width)
+        if (of_lines[:, -1] > ends).any() or (of_lines[1:, 0] < ends[:-1]).any():
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                values = np.fromstring(data, sep=" ")
+            except (DeprecationWarning, ValueError):  # of what is not a number
+                return None
+        return values.reshape(-1, width) if values.size == begins.size else None
 
     def lines(self) -> Iterator[tuple[int, str]]:
         """Lines with their numbers, without comments and empty lines."""
@@ -43,6 +93,10 @@ class LineParser:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+
+    def at_once(self, block: Block) -> Any:
+        """What a block of plain numbers is kept as; None where its lines are to be taken one by one."""
+        return None
 
     def row(self, number: int, line: str) -> Any:
         """What a line holds; None where it is a header."""
@@ -69,10 +123,16 @@ class Parsed(NamedTuple):
 def parsed(parser: LineParser) -> Parsed:
     """A text file, parsed block by block."""
     parts: list[Any] = []
-    line_numbers: list[int] = []
+    line_numbers: list[Indices] = []
     open_line = 0
     cut = ""
     for block in blocks(parser.path):
+        part = parser.at_once(block)
+        if part is not None:
+            parts.append(part)
+            line_numbers.append(np.arange(block.first, block.first + block.count))
+            open_line = 0
+            continue
         rows = []
         numbers = []
         for number, line in block.lines():
@@ -83,9 +143,9 @@ def parsed(parser: LineParser) -> Parsed:
                 numbers.append(number)
         if rows:
             parts.append(parser.part(rows, numbers))
-            line_numbers += numbers
+            line_numbers.append(np.array(numbers, int))
             open_line = 0 if block.ends else numbers[-1]
-    return Parsed(parts, np.array(line_numbers, int), open_line, cut)
+    return Parsed(parts, np.concatenate(line_numbers or [np.zeros(0, int)]), open_line, cut)
 
 
 def blocks(path: Path) -> Iterator[Block]:
@@ -112,19 +172,14 @@ def blocks(path: Path) -> Iterator[Block]:
             require_room(path, file.tell())
             head, end, tail = data.rpartition(b"\n")
             if end:
-                block = Block(_lines(path, b"".join([*rest, head, end])), first, ends=True)
+                block = Block(path, b"".join([*rest, head, end]), first, ends=True)
                 yield block
-                first += len(block.rows)
+                first += block.count
                 rest = []
             rest.append(tail)
             data = _read(path, file)
     if last := b"".join(rest):
-        yield Block(_lines(path, last), first, ends=False)
-
-
-def _lines(path: Path, data: bytes) -> list[str]:
-    with reading(path, REFUSAL):
-        return data.decode("utf-8").splitlines()
+        yield Block(path, last, first, ends=False)
 
 
 def line_of(path: Path, wanted: int) -> str:
@@ -235,6 +290,16 @@ class _NumberLines(LineParser):
         self.layout = layout
         self.header = header
         self.width = 0  # of the lines before, 0 without any
+
+    def at_once(self, block: Block) -> Array | None:
+        width = self.width or len(_fields(block.plain.partition(b"\n")[0].decode()))
+        if width not in self.widths or block.first <= self.header:
+            return None
+        values = block.numbers(width)
+        if values is None:
+            return None
+        self.width = width
+        return bounded(values)
 
     def row(self, number: int, line: str) -> list[str] | None:
         if number == self.header:

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.valid_covariances import ROUNDED
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
@@ -202,7 +203,7 @@ def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:
     with np.errstate(invalid="ignore"):
         variance = np.diagonal(P, axis1=1, axis2=2)
         good = finite_rows(errors) & finite_rows(P)
-        good &= (variance > 0).all(axis=1)
+        good &= (variance > ROUNDED.zero).all(axis=1)
     sigma = np.sqrt(variance[good])
     R = P[good]
     R /= sigma[:, :, None] * sigma[:, None, :]

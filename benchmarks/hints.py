@@ -156,6 +156,98 @@ def honest(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
     return f"{kind}, {wrong}", hints("est", AXES[kind], poses)
 
 
+# --- plain faults -----------------------------------------------------------------------------------
+
+PLAIN = ("start", "middle", "drift", "bias", "scale", "axis", "outliers", "runs")
+COURSES = ("constant", "growing", "two qualities", "wandering", "turning")
+MOST_WRONG = 30.0  # of errors, or of standard deviations
+
+
+def plain(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
+    """The fault of a filter whose files are not mixed up, and the hints that it gets."""
+    kind = list(AXES)[rng.integers(len(AXES))]
+    n = len(AXES[kind])
+    runs, steps = SIZES[rng.integers(len(SIZES))]
+    convention = {"spatial": "so3", "planar": "so2"}.get(kind, "vector")
+    P = stated(rng, kind, steps)
+    L = np.linalg.cholesky(P)
+    wrong = PLAIN[number % len(PLAIN)]
+    rho = (0.0, 0.0, 0.5, 0.9)[rng.integers(4)]
+    factor = np.exp(rng.uniform(np.log(2.0), np.log(MOST_WRONG)))
+    factors = factor_of(rng, wrong, runs, steps, n, factor)
+    of_P = wrong not in ("outliers", "drift", "bias") and rng.random() < 0.5
+    if of_P and rng.random() < 0.3:
+        factors = 1.0 / factors
+    offset = np.zeros(n)
+    if wrong == "bias":
+        offset = rng.normal(size=n) * factor / 3.0
+    found = []
+    for scale in factors:
+        e = np.einsum("kij,kj->ki", L, noise(rng, steps, n, rho, False))
+        e += offset * np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        own = P
+        if of_P:
+            own = P / (scale[:, :, None] * scale[:, None, :])
+        else:
+            e = e * scale
+        found.append(run_of(rng, kind, convention, e, own))
+    return f"{kind}, {wrong}{' of P' * of_P}", hints("est", AXES[kind], found)
+
+
+def stated(rng: np.random.Generator, kind: str, steps: int) -> Array:
+    """Covariances (steps, n, n) of any size and shape: alike or unlike axes, correlated or not, in any course."""
+    n = len(AXES[kind])
+    near_one = rng.random() < 0.5
+    sigma = np.full(n, 10.0 ** (rng.uniform(-0.5, 0.5) if near_one else rng.uniform(-3.0, 1.5)))
+    shape = max(rng.integers(-1, 3), 0)
+    if kind in ("spatial", "planar"):
+        sigma[{"spatial": 3, "planar": 2}[kind] :] = 10.0 ** rng.uniform(-3.0, -1.0)
+    if shape:
+        sigma = sigma * np.exp(rng.uniform(-1.5, 1.5, n))
+    P = covariance(rng, sigma, shape == 2)
+    time = np.linspace(0.0, 1.0, steps)
+    course = COURSES[max(rng.integers(-2, len(COURSES)), 0)]
+    size = np.ones(steps)
+    if course == "growing":
+        size = 0.01 + time
+    if course == "two qualities":
+        size = np.where(np.sin(rng.uniform(10.0, 60.0) * time) > rng.uniform(-0.8, 0.8), 1.0, 10.0 ** rng.uniform(0, 2))
+    if course == "wandering":
+        size = np.exp(np.cumsum(rng.normal(size=steps)) * 2.0 / np.sqrt(steps))
+    if course == "turning" and n > 1:
+        angles = rng.uniform(1.0, 9.0) * time
+        turn = np.tile(np.eye(n), (steps, 1, 1))
+        turn[:, :2, :2] = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()[:, :2, :2]
+        return np.asarray(turn @ P @ np.swapaxes(turn, 1, 2))
+    return np.asarray(P * size[:, None, None])
+
+
+def factor_of(rng: np.random.Generator, wrong: str, runs: int, steps: int, n: int, factor: float) -> Array:
+    """Factors (runs, steps, n) on errors, where the fault is."""
+    out = np.ones((runs, steps, n))
+    part = np.ones(n, bool)
+    if rng.random() < 0.3 or wrong == "axis":
+        part = rng.permutation(n) == 0
+    begin, end = 0, steps
+    if wrong == "start":
+        end = int(np.ceil(rng.uniform(0.02, 0.5) * steps))
+    if wrong == "middle":
+        begin, end = np.sort(rng.integers(0, steps + 1, 2))
+    where = np.zeros((runs, steps), bool)
+    where[:, begin:end] = True
+    if wrong == "runs":
+        where &= (rng.random(runs) < rng.uniform(0.05, 0.5))[:, None]
+    if wrong == "outliers":
+        where = rng.random((runs, steps)) < rng.uniform(0.005, 0.2)
+    strength = np.full((runs, steps), factor)
+    if wrong == "drift":
+        strength = np.tile(np.geomspace(1.0, factor, steps), (runs, 1))
+    out[where[:, :, None] & part] = (strength[:, :, None] * part)[where[:, :, None] & part]
+    if wrong == "bias":
+        out[:] = 1.0
+    return out
+
+
 # --- mix-ups ----------------------------------------------------------------------------------------
 
 
@@ -392,6 +484,7 @@ def main() -> int:
         __doc__.splitlines()[0] if __doc__ else "",
         logs=(1200, "Honest logs."),
         cells=(20, "Logs of each mix-up and factor; 0 for none."),
+        plain=(400, "Logs with a plain fault of any size."),
         gross=(10, "Logs of each gross mix-up and scale; 0 for none."),
         slow=(200, "Slow logs."),
         seed=(5, None),
@@ -406,6 +499,13 @@ def main() -> int:
             print(f"  honest ({label}): {hint}", flush=True)
     total = sum(found.values())
     print(f"honest logs with a hint: {total} of {given.logs}")
+    plainly = 0
+    for number in range(given.plain):
+        label, said = plain(np.random.default_rng((given.seed, 97, number)), number)
+        plainly += bool(said)
+        for hint in said:
+            print(f"  plain ({label}): {hint}", flush=True)
+    print(f"plain faults with a hint: {plainly} of {given.plain}")
     drifts = [
         hint for number in range(given.slow) for hint in slow(np.random.default_rng((given.seed, 98, number)), number)
     ]

@@ -42,7 +42,8 @@ def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
 def _blocks(p: Poses, axes: Sequence[str]) -> list[list[int]]:
     """Places of the positions, and of velocities along the same axes; none where the state has no positions."""
     if p.manifold != "vector":
-        return [list(range(p.d))]
+        poses_alone = p.covariance.shape[-1] <= 6
+        return [list(range(p.d))] if poses_alone else []
     for names in map(str.split, NAMES):
         for d in (3, 2):
             speeds = list(map(SPEED.format, names[:d]))

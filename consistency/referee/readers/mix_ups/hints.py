@@ -171,10 +171,10 @@ def _likeliest(
 
 def _either(texts: Sequence[str]) -> str:
     """Causes between which the errors do not decide, the likelier first."""
-    said = list(texts[:MOST_SAID])
+    said = "; or if ".join(texts[:MOST_SAID])
     if len(texts) > MOST_SAID:
-        said.append(f"for {len(texts) - MOST_SAID} more causes that fit as well")
-    return "; or if ".join(said).replace("or if for", "or for")
+        said += f" ({len(texts)} causes fit equally)"
+    return said
 
 
 def _status(fit: ReadingFit) -> int:

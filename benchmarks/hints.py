@@ -11,10 +11,12 @@ tails, a drift. Several kinds of state, sizes, units, numbers of runs, and corre
 
 Gross mix-ups are of logs of all these sizes and correlations, of a filter that is right, or whose covariance is 4 times
 too large or too small: only draws count whose NEES falls by 10 or more with the mix-up undone. Slow logs are single
-drifts whose covariance is a number that nobody estimated.
+drifts whose covariance is a number that nobody estimated. Plain faults are factors of 2 to 30 on errors or deviations:
+at the start, in the middle, in some runs, of one axis or at random; and drifts and biases as large. Their covariances
+have any size, shape and course.
 
-Exit status 1 if more than 6 of 1,200 honest logs, or of the slow ones, get a hint (as large a share of another number),
-or if fewer than 80 % of a kind of gross mix-up, or 90 % of all, are named.
+Exit status 1 if more than 6 of 1,200 honest logs, or of the slow ones, or 4 of 400 plain faults get a hint (as large a
+share of another number), or if fewer than 80 % of a kind of gross mix-up, or 90 % of all, are named.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ SIZES = ((1, 200), (1, 1500), (5, 100), (20, 50), (40, 30))  # runs, steps
 MEMORY = (0.0, 0.5, 0.9, 0.98, 0.999)
 WRONG = ("right", "all", "axis", "bias", "tails", "drift")
 PROMISE = 6 / 1200
+OF_PLAIN = 4 / 400
 SPREAD = 4.0  # of variances among axes of one kind, at most, where a log does not say otherwise
 Mess = Callable[[Poses], Poses]
 
@@ -183,6 +186,7 @@ def plain(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
     offset = np.zeros(n)
     if wrong == "bias":
         offset = rng.normal(size=n) * factor / 3.0
+        factors = np.ones_like(factors)
     found = []
     for scale in factors:
         e = np.einsum("kij,kj->ki", L, noise(rng, steps, n, rho, False))
@@ -245,8 +249,6 @@ def factor_of(rng: np.random.Generator, wrong: str, runs: int, steps: int, n: in
     if wrong == "drift":
         strength = np.tile(np.geomspace(1.0, factor, steps), (runs, 1))
     out[where[:, :, None] & part] = (strength[:, :, None] * part)[where[:, :, None] & part]
-    if wrong == "bias":
-        out[:] = 1.0
     return out
 
 
@@ -576,7 +578,8 @@ def main() -> int:
         print(f"  slow: {hint}", flush=True)
     print(f"slow logs with a hint: {len(drifts)} of {given.slow}")
     enough = not given.gross or print_gross(given.seed, given.gross)
-    return int(total > PROMISE * given.logs or len(drifts) > PROMISE * given.slow or not enough)
+    many = total > PROMISE * given.logs or plainly > OF_PLAIN * given.plain or len(drifts) > PROMISE * given.slow
+    return int(many or not enough)
 
 
 if __name__ == "__main__":

@@ -480,7 +480,7 @@ def test_one_block_in_another_order_is_named(order, words, rng):
 def test_orders_that_fit_equally_are_all_said(place, turn, rng):
     runs = world.log(rng, "spatial", 20, 50, 0.0, sigma=np.array(place + turn), correlated=False)
     (said,) = hints("est", SIX, [world.reordered([0, 1, 2, 5, 4, 3])(p) for p in runs])
-    assert "the rotations of the covariance are in the order yaw, pitch, roll; write them as roll, pitch, yaw; or" in said
+    assert "the rotations of the covariance are in the order yaw, pitch, roll; write them as" in said
     assert "(rotations alike)" in said
     assert said.endswith("(4 causes fit equally)") == (turn[0] == turn[1])
 
@@ -523,8 +523,9 @@ def orbits(rng, sigma, names):
     return runs
 
 
-@pytest.mark.parametrize("names", [("x", "y", "z"), ("x", "y", "z", "vx", "vy", "vz"), ("x", "vx", "y", "vy", "z", "vz")])
-def test_velocities_are_turned_with_positions(names, rng):
+@pytest.mark.parametrize("state", ["x y z", "x y z vx vy vz", "x vx y vy z vz"])
+def test_velocities_are_turned_with_positions(state, rng):
+    names = state.split()
     sigma = np.array([1.0, 20.0, 0.5, 0.02, 0.001, 0.0005])
     (said,) = hints("est", names, orbits(rng, sigma, names))
     assert "the covariance of x, y, z is along radius, track and normal; turn it into the axes of x, y, z" in said
@@ -617,6 +618,51 @@ def test_causes_are_shown_by_print_and_gate(rng):
     assert cause in verdict._repr_html_()
     with pytest.raises(AssertionError, match="its diagonal holds standard deviations"):
         assert_consistent(errors, P)
+
+
+def sized(rng, factors, runs=40, steps=50):
+    """Errors of components whose mean squares are those numbers, with no chance in it, beside I."""
+    e = rng.normal(size=(runs, steps, len(factors)))
+    e *= np.sqrt(np.array(factors) / np.square(e).mean(axis=(0, 1)))
+    return e, np.broadcast_to(np.eye(len(factors)), (*e.shape, len(factors)))
+
+
+@pytest.mark.parametrize(
+    "factor, n, words",
+    [
+        (1.96**2, 2, "deviations stated at 95 % (1.96 sigma)"),
+        (1.96**2, 3, "deviations stated at 95 % (1.96 sigma)"),
+        (1.96**2, 1, "deviations stated at 95 % (1.96 sigma)"),
+        (4.0, 2, "deviations of 2 sigma"),
+        (4.0, 5, "deviations of 2 sigma"),
+        (2.0 * np.log(2.0), 2, "a CEP in place of deviations (the radius of 50 % in the plane, 1.1774 sigma)"),
+    ],
+)
+def test_a_ratio_of_a_usual_level_is_perhaps_that_level(factor, n, words, rng):
+    (cause,) = judge(*sized(rng, [1.0 / factor] * n)).causes
+    assert words in cause
+    assert cause.startswith("perhaps")
+    assert {3: "is 3.84 ", 4: "4 times", 1: "is 1.386 times"}[int(factor)] in cause
+
+
+@pytest.mark.parametrize(
+    "factors, runs",
+    [
+        ([1 / 2.5] * 2, 40),
+        ([1 / 7.0] * 3, 40),
+        ([1 / 1.386] * 3, 40),  # there is no radius of so many
+        ([1 / 3.84] * 2, 8),  # too few to tell
+        ([1 / 3.84, 1 / 2.5], 40),
+        ([3.84] * 2, 40),
+    ],
+)
+def test_other_ratios_are_no_level(factors, runs, rng):
+    assert judge(*sized(rng, factors, runs)).causes == ()
+
+
+def test_a_cause_that_is_known_leaves_no_perhaps(rng):
+    e, P = sized(rng, [1 / 3.84] * 2)
+    assert judge(Record("est", error=e, covariance=P, causes=("known",))).causes == ("known",)
 
 
 # --- frames -----------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ LEVELS = {
 def level_causes(found: Findings) -> list[str]:
     """Usual levels whose factor the interval of the ratio holds, if it is narrow and all components agree; or none.
 
-    Other faults make such a ratio, too: of filters whose covariance is too large by any factor up to 30, one in 15 has it.
+    Other faults make such a ratio, too: about one in 20 of the filters whose covariance is too large by any factor.
     """
     if found.status != "conservative" or found.scale is None:
         return []
@@ -33,4 +33,4 @@ def level_causes(found: Findings) -> list[str]:
         return []
     words = " or ".join(LEVELS[of] for of in fitting)
     factors = " or ".join(f"{of:g}" for of in fitting)
-    return [f"perhaps it holds {words}: a covariance {factors} times too large would fit that, and other faults, too"]
+    return [f"perhaps a matter of what is stated: a covariance that is {factors} times too large would fit {words}"]

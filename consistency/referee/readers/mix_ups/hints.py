@@ -149,9 +149,7 @@ def _candidates(
         yield Candidate(guess, fit, size, gain)
 
 
-def _likeliest(
-    candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float
-) -> Sequence[Candidate]:
+def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Sequence[Candidate]:
     """The likeliest candidates that are right but for a common factor, which are equally likely; at need the last."""
     right = []
     at_need = []

@@ -143,11 +143,14 @@ class ReadingFit:
         return self.size >= ENOUGH and self.right(False) and bool(off <= limit)
 
     def near(self) -> float:
-        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
+        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``.
+
+        Pieces of the steps, or of the runs, may have factors of their own beside it.
+        """
         f = _common_factor(self.scale)
         gain = self.scale - self.scale / f - float(np.log(f))
         whole = self.scale - 1.0 - float(np.log(max(self.scale, 1e-300)))
-        of_pieces = self._in_pieces([], POWERS[:1]) - 0.5 * self.n * whole
+        of_pieces = self._in_pieces(self._squares([]), 0, POWERS[:1]) - 0.5 * self.n * whole
         return self.likelihood + 0.5 * self.n * gain + max(of_pieces, 0.0)
 
     def is_off(self) -> bool:
@@ -167,16 +170,19 @@ class ReadingFit:
 
         That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
         of position or of attitude, or of any size there where one number was written for all variances; or a bias of
-        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``.
+        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``. Faults in some steps or
+        runs, factors of one component up to ``WIDE``, and covariances whose changes of size mean less than stated
+        cost ``COST`` for each of their numbers.
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
         constant = self.error.mean(axis=0) / self.sigma
         growing = np.tile(self.own.mean(axis=0), (len(self.own), 1))
-        of_bias = map(self._with_bias, (constant, growing))
-        of_factor = map(self._with_factor, groups)
-        of_pieces = [self._in_pieces(group, POWERS) for group in groups]
-        return self.likelihood + max(*of_bias, *of_factor, *of_pieces)
+        gains = [self._with_bias(bias) for bias in (constant, growing)]
+        for group in groups:
+            squares = self._squares(group)
+            gains += [self._with_factor(squares, len(group)), self._in_pieces(squares, len(group), POWERS)]
+        return self.likelihood + max(gains)
 
     def _with_bias(self, bias: Array) -> float:
         """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
@@ -187,36 +193,40 @@ class ReadingFit:
         f = _common_factor(after)
         return 0.5 * self.n * (self.scale - after / f - float(np.log(f)))
 
-    def _with_factor(self, group: list[int]) -> float:
-        """Log likelihood that an estimate gains by a factor on some components, beside one on all."""
+    def _with_factor(self, squares: Array, size: int) -> float:
+        """Log likelihood that an estimate gains by a factor on ``size`` components, beside one on all.
+
+        ``squares`` are those of :meth:`_squares`.
+        """
         most = np.log(FACTOR)
         if np.ptp(self.sigma) <= 1e-9 * self.sigma.max():
             most = np.log(ANY)
         f = np.exp(np.linspace(-most, most, 61))
-        mean = self._squares(group).mean(axis=0, keepdims=True)
-        return 0.5 * (self.n * (self.scale - 1.0) - float(_least(mean, f, len(group), self.n)[0]))
+        mean = squares.mean(axis=0, keepdims=True)
+        return 0.5 * (self.n * (self.scale - 1.0) - float(_least(mean, f, size, self.n)[0]))
 
-    def _in_pieces(self, group: list[int], powers: Sequence[float]) -> float:
-        """The same where the factors differ between pieces of the steps or of the runs, less what so many cost.
+    def _in_pieces(self, squares: Array, size: int, powers: Sequence[float]) -> float:
+        """Log likelihood that an estimate gains by such factors in each piece of the steps or of the runs.
 
-        The size of the stated covariance may count by a power of itself.
+        The size of the stated covariance counts by one of the ``powers`` of itself. What the numbers cost is taken off.
         """
-        f = np.exp(np.linspace(-1.0, 1.0, 61) * np.log(WIDE)) if group else np.ones(1)
-        squares = self._squares(group)
+        f = np.exp(np.linspace(-1.0, 1.0, 61) * np.log(WIDE)) if size else np.ones(1)
         best = -np.inf
         for power, pieces in itertools.product(powers, self._pieces):
             count = np.bincount(pieces)
             share = count / len(pieces)
-            weighed = squares * np.exp((1.0 - power) * self._log_size)[:, None]
-            means = np.array([np.bincount(pieces, column) for column in weighed.T]).T / count[:, None]
-            left = float(share @ _least(means, f, len(group), self.n))
-            fitted = len(count) * (1 + bool(group)) - (power == 1.0)
+            weighed = squares.T * np.exp((1.0 - power) * self._log_size)
+            means = np.array([np.bincount(pieces, column) for column in weighed]).T / count[:, None]
+            left = float(share @ _least(means, f, size, self.n))
+            fitted = len(count) * (1 + bool(size)) - (power == 1.0)
             cost = COST * fitted / self.size
             best = max(best, 0.5 * (self.n * (self.scale - 1.0) - left) - cost)
         return best
 
     def _squares(self, group: list[int]) -> Array:
         """w'w, w'p and p'p of the whitened errors w and their part p that is of some components, (K, 3)."""
+        if not group:
+            return np.column_stack([self.nees, np.zeros((len(self.nees), 2))])
         of_group = np.zeros_like(self.own)
         of_group[:, group] = self.own[:, group]
         part = _solved(self.factor, of_group)

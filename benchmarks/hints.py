@@ -205,14 +205,14 @@ def stated(rng: np.random.Generator, kind: str, steps: int) -> Array:
     n = len(AXES[kind])
     near_one = rng.random() < 0.5
     sigma = np.full(n, 10.0 ** (rng.uniform(-0.35, 0.35) if near_one else rng.uniform(-3.0, 1.5)))
-    shape = max(rng.integers(-2, 3), 0)
+    shape = max(int(rng.integers(-2, 3)), 0)
     if kind in ("spatial", "planar"):
         sigma[{"spatial": 3, "planar": 2}[kind] :] = 10.0 ** rng.uniform(-3.0, -1.0)
     if shape:
         sigma = sigma * np.exp(rng.uniform(-1.5, 1.5, n))
     P = covariance(rng, sigma, shape == 2)
     time = np.linspace(0.0, 1.0, steps)
-    course = COURSES[max(rng.integers(-2, len(COURSES)), 0)]
+    course = COURSES[max(int(rng.integers(-2, len(COURSES))), 0)]
     size = np.ones(steps)
     if course == "growing":
         size = 0.01 + time

@@ -476,7 +476,14 @@ def test_one_block_in_another_order_is_named(order, words, rng):
     assert said.endswith(f"{words}; write them as {own}")
 
 
-@pytest.mark.parametrize("place, turn", [([0.1, 0.1, 0.1], [0.01, 0.02, 0.05]), ([0.3, 0.3, 0.3], [0.01, 0.01, 0.06])])
+@pytest.mark.parametrize(
+    "place, turn",
+    [
+        ([0.1, 0.1, 0.1], [0.01, 0.02, 0.05]),
+        ([0.3, 0.3, 0.3], [0.01, 0.01, 0.06]),
+        ([2.0, 2.0, 2.0], [0.03, 0.001, 0.01]),
+    ],
+)
 def test_orders_that_fit_equally_are_all_said(place, turn, rng):
     runs = world.log(rng, "spatial", 20, 50, 0.0, sigma=np.array(place + turn), correlated=False)
     (said,) = hints("est", SIX, [world.reordered([0, 1, 2, 5, 4, 3])(p) for p in runs])

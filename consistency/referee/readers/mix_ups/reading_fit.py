@@ -33,6 +33,7 @@ ANY = 1e8  # the same of a number that stands for all variances
 WIDE = 1e3  # the same of a fault in some steps or runs, or of any size that is rarer
 PIECES = 10  # of the steps, and of the runs, in which a fault may have sizes of its own
 COST = 1.5  # log likelihood of each number that is fitted to such a fault
+RARE = 10.0  # the same of such a fault of one component, which is as rare as one of some 20 mix-ups
 POWERS = (1.0, 0.5, 0.0)  # of the size of the stated covariance: what it varies by may mean nothing
 ODD = 1e-3  # probability that errors with the stated covariance are not taken for such
 GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
@@ -172,7 +173,7 @@ class ReadingFit:
         of position or of attitude, or of any size there where one number was written for all variances; or a bias of
         at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``. Faults in some steps or
         runs, factors of one component up to ``WIDE``, and covariances whose changes of size mean less than stated
-        cost ``COST`` for each of their numbers.
+        cost ``COST`` for each of their numbers; such a wide factor is as rare as a mix-up.
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
@@ -219,8 +220,8 @@ class ReadingFit:
             means = np.array([np.bincount(pieces, column) for column in weighed]).T / count[:, None]
             left = float(share @ _least(means, f, size, self.n))
             fitted = len(count) * (1 + bool(size)) - (power == 1.0)
-            cost = COST * fitted / self.size
-            best = max(best, 0.5 * (self.n * (self.scale - 1.0) - left) - cost)
+            cost = COST * fitted + RARE * bool(size)
+            best = max(best, 0.5 * (self.n * (self.scale - 1.0) - left) - cost / self.size)
         return best
 
     def _squares(self, group: list[int]) -> Array:

@@ -44,13 +44,13 @@ def scale_text(v: Findings) -> str:
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
-    if MAIN not in v.faults and (contrary or not v.location.lasting):
+    if MAIN not in v.faults and (contrary or not (v.location.lasting or v.location.since)):
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
     size, note = _size_and_note(v, inflation)
-    text = f"covariance{about} {size}{_since(v)}"
+    text = f"covariance{about} {size}{since_text(v)}"
     factors = ""
     if not about:
         factors = factors_text(v)
@@ -102,10 +102,14 @@ def _first_visible(v: Findings) -> str:
     return f", first visible in {v.place(where.first_step)}"
 
 
-def _since(v: Findings) -> str:
-    if v.location is None or v.location.since is None:
+def since_text(v: Findings) -> str:
+    """Where a fault is that begins late: " since step 21", or " in steps 21 to 40" where it ends; '' otherwise."""
+    where = v.location
+    if where is None or where.since is None:
         return ""
-    return f" since {v.place(v.location.since)}"
+    if where.until is None:
+        return f" since {v.place(where.since)}"
+    return f" in {v.places_between(where.since, where.until.step)}"
 
 
 def _side(sign: float) -> str:
@@ -178,7 +182,7 @@ def _axes_text(v: Findings) -> str:
         return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
     if not off:
         return "covariance wrong in an axis"
-    return f"covariance {_sizes_in_axes(off)}{_since(v)}"
+    return f"covariance {_sizes_in_axes(off)}{since_text(v)}"
 
 
 def _direction_text(v: Findings) -> str:
@@ -201,7 +205,7 @@ def _correlation_text(v: Findings) -> str:
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
-    return f"{text}, but {off_by_factor(worst)} in one direction{_since(v)}"
+    return f"{text}, but {off_by_factor(worst)} in one direction{since_text(v)}"
 
 
 # --- bias, shape, tails, maps --------------------------------------------------------------------------

@@ -154,14 +154,22 @@ def _first_steps(v: Findings) -> list[str]:
     if v.location is None or v.location.until is None:
         return []
     until = v.location.until
+    if v.location.since is not None:
+        where = v.places_between(v.location.since, until.step)
+        return [f"the fault is in {where} only; in the others the covariance ratio is {ratio_text(until.late)}"]
     where = "the first step"
     if until.step > 1:
         where = f"the first {until.step} steps"
-    return [
+    text = (
         f"the fault is in {where} only, where the covariance ratio is {short(until.early)}; after that it is "
-        f"{ratio_text(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} "
-        "in a gate) and judge other runs by it"
-    ]
+        f"{ratio_text(until.late)}"
+    )
+    if v.scale is not None and 2 * until.step <= len(v.scale.alive):
+        text += (
+            f". If the start is not meant to count, state --skip {until.step} (skip={until.step} in a gate) and judge "
+            "other runs by it"
+        )
+    return [text]
 
 
 def _no_fault(v: Findings, s: Scale) -> str:

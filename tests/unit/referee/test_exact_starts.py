@@ -67,12 +67,11 @@ def test_a_truth_that_all_runs_share_is_named(rng, shift):
     assert not said(judge(recorded(error, P, drawn)))
 
 
-def test_a_shared_path_is_no_cause_of_errors_that_are_too_large_or_right(rng):
+def test_a_shared_path_is_no_cause_of_errors_of_one_size(rng):
     P = np.tile(np.eye(4), (40, 20, 1, 1))
     true = np.tile(np.cumsum(rng.normal(size=(1, 20, 2)), axis=1), (40, 1, 1))
-    for scale in (1.0, 2.0):
+    for scale in (0.5, 1.0, 2.0):
         assert not said(judge(recorded(scale * independent(rng, 40, 20, 4), P, true), Settings(SURE)))
-    assert said(judge(recorded(0.5 * independent(rng, 40, 20, 4), P, true)))
 
 
 @pytest.mark.parametrize("small", [0, 3, 8])

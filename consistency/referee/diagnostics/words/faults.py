@@ -17,6 +17,7 @@ from consistency.referee.diagnostics.words.numbers import (
     plural,
     ratio_text,
     short,
+    since_text,
 )
 from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
@@ -100,16 +101,6 @@ def _first_visible(v: Findings) -> str:
     if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
         return ""
     return f", first visible in {v.place(where.first_step)}"
-
-
-def since_text(v: Findings) -> str:
-    """Where a fault is that begins late: " since step 21", or " in steps 21 to 40" where it ends; '' otherwise."""
-    where = v.location
-    if where is None or where.since is None:
-        return ""
-    if where.until is None:
-        return f" since {v.place(where.since)}"
-    return f" in {v.places_between(where.since, where.until.step)}"
 
 
 def _side(sign: float) -> str:
@@ -234,6 +225,8 @@ def bias_text(v: Findings, in_steps: bool) -> str:
 
 
 def _sigmas(value: float) -> str:
+    if 0.0 < abs(value) < 0.01:
+        return f"{value:+.2g}"
     if abs(value) < 100.0:
         return f"{value:+.2f}"
     return f"{value:+.1e}"

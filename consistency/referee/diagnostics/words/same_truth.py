@@ -11,11 +11,15 @@ from consistency.referee.diagnostics.verdict.verdict import Findings
 
 FEWEST = 8  # runs; fewer true starts may be near each other by chance
 SAME = 0.1  # of the stated variance of the position, which that of true starts drawn from it exceeds
+LESS = 0.5  # of the median of all steps, that the NEES of the first one is at most
 ROUNDING = 1e-9  # of the extent of a path
 
 
 def same_truth(record: Record, found: Findings) -> list[str]:
-    """That all runs have the same true path or start, where the covariance of the first judged step is too large."""
+    """That all runs have the same true path or start, where the covariance is too large in the first judged step.
+
+    There it has to be worse than in most: a covariance that is too large throughout is so for another reason.
+    """
     where = found.location
     if record.path is None or where is None or where.first_outside is None or len(record.path) < FEWEST:
         return []
@@ -23,7 +27,8 @@ def same_truth(record: Record, found: Findings) -> list[str]:
     assert record.nees is not None
     assert found.scale is not None
     step = int(np.argmax(found.scale.alive > 0))
-    is_below = bool(found.scale.anees[step] < where.simultaneous[step, 0])
+    anees = found.scale.anees
+    is_below = bool(anees[step] < min(where.simultaneous[step, 0], LESS * float(np.nanmedian(anees))))
     if not is_below or not set(found.faults) & set(SCALE):
         return []
     true = record.path[:, :, 0]

@@ -29,7 +29,8 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
         "tolerance": m.tolerance, "gate": m.gate, "mission": m.mission, "note": CAVEAT,
         "alarm": None if alarm is None else {
             "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
-            "evidence": alarm.evidence, "scale": alarm.scale, "sentence": str(alarm),
+            "evidence": alarm.evidence, "scale": alarm.scale, "outlier": alarm.outlier,
+            "rest": alarm.rest, "sentence": str(alarm),
         },
     }  # fmt: skip
     cells: list[tuple[str, Cell]] = [("steps", str(m.steps)), ("judged", str(m.innovations))]

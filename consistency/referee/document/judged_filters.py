@@ -14,7 +14,15 @@ import numpy as np
 
 from consistency.referee.diagnostics.judging.status import clear
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN, p_text, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.words.numbers import (
+    UNCERTAIN,
+    p_text,
+    percent,
+    plural,
+    ratio_text,
+    short,
+    since_text,
+)
 from consistency.referee.diagnostics.words.sentences import question_text
 from consistency.referee.document.blocks import (
     Block,
@@ -215,7 +223,9 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         accepted = "not judged" if v.parts else f"{' to '.join(map(short, s.accepted))} accepted"
         rows.append(("mean NEES", f"{short(s.mean_anees)} ({s.dof} expected, {accepted})"))
         value, low, high = s.inflation
-        rows.append(("covariance ratio", f"{short(value)} [{short(low)}, {short(high)}], true / stated"))
+        where = since_text(v)
+        ratio = f"{short(value)} [{short(low)}, {short(high)}], true / stated{where}"
+        rows.append(("covariance ratio", ratio))
         if v.axis is not None:
             rows.append(("decided by", f"{v.axis[0]}, {ratio_text(v.axis[1])}"))
         elif (worst := clear(v.worst_axis)) is not None:
@@ -223,7 +233,8 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         if s.within is not None:
             rows.append(("within the log", f"{ratio_text(s.within.ratio)}, if errors decorrelate as within it"))
         ends = f"[{short(1 / shown.factor)}, {short(shown.factor)}]"
-        rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)})"))
+        of_all = f", in all {v.places}" if where else ""
+        rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)}){of_all}"))
         if v.lost is not None:
             rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
     if v.accuracy is not None and v.axes is not None and np.isfinite(v.accuracy.coverage).any():

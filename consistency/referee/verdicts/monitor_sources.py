@@ -76,7 +76,7 @@ def read_innovations(path: Path, filter_name: str | None = None, run: int | None
 
 
 def watch(log: NisLog, monitor: Monitor) -> Watched:
-    """Put the innovations of a run through a new monitor."""
+    """Put the innovations of a run through a new monitor; beside an outlier, the whole log counts."""
     evidence = np.empty(len(log.nis))
     for row, (nis, dof) in enumerate(zip(log.nis.tolist(), log.dof.tolist(), strict=True)):
         monitor.update(nis, int(dof))
@@ -88,6 +88,8 @@ def watch(log: NisLog, monitor: Monitor) -> Watched:
         since = alarm.since - 1
         times = float(log.t[row]), float(log.t[since])
         alarm = replace(alarm, step=int(log.step[row]), since=int(log.step[since]))
+        if alarm.outlier is not None:
+            alarm = replace(alarm, outlier=int(log.step[alarm.outlier - 1]), rest=monitor.rest)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(log.dof > 0, log.nis / log.dof, np.nan)
     return Watched(log.name, monitor, alarm, *times, log.step, log.t, ratio, evidence)

@@ -431,7 +431,7 @@ def test_the_monitor_alarms_and_names_the_outlier():
     alarms = [alarm for x in nis if (alarm := monitor.update(x, np.int64(2))) is not None]
     assert [alarm.step for alarm in alarms] == [51]
     assert alarms[0].rest == 1.0
-    assert "; the NIS of this step is an outlier, and that of all before x1, e-value" in str(alarms[0])
+    assert "; the NIS of this step is an outlier, and that of the others x1, e-value" in str(alarms[0])
     monitor = cs.Monitor()
     alarms = [alarm for _ in range(50) if (alarm := monitor.update(20.0, 2)) is not None]
     assert "outlier" not in str(alarms[0])

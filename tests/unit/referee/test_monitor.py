@@ -14,6 +14,7 @@ from scipy import special, stats
 import consistency as cs
 from consistency.referee.diagnostics.monitoring.monitor import RATIOS, alternatives, bet_on, start_share
 from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit, gated_mean, gated_scale, log_chi2_cdf
+from consistency.referee.verdicts.monitor_sources import read_innovations, watch
 
 
 def fed(monitor, nis, dof):
@@ -410,3 +411,43 @@ def test_the_example_of_the_manual(tmp_path, capsys):
     printed = capsys.readouterr().out.split()
     assert printed == blocks("docs/monitor.md", "text")[0].text.split()
     assert printed[:3] == ["alarm", "in", "step"]
+
+
+# --- one outlier ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "nis, dof, before", [(49.0, 2, 0), (60.0, 1, 0), (40.0, 2, 0), (60.0, 1, 1), (90.0, 2, 50), (300.0, 6, 50)]
+)
+def test_an_outlier_is_no_fault_since(nis, dof, before, tmp_path):
+    """NIS of exactly 1 a degree of freedom beside it; the log as a whole tells that nothing else is wrong."""
+    values = np.array([*[dof] * before, nis, *[dof] * 99], float)
+    monitor = cs.Monitor()
+    (alarm,) = fed(monitor, values, dof)
+    assert (alarm.step, alarm.since, alarm.outlier) == (before + 1,) * 3
+    assert "overconfident since" not in str(alarm)
+    assert "the NIS of this step is an outlier" in str(alarm)
+    assert math.isnan(alarm.rest) if not before else alarm.rest == 1.0
+    t = np.arange(len(values)) / 10.0
+    np.savez(tmp_path / "log.npz", nis=values, nis_dof=np.full(len(values), dof), t=t)
+    whole = watch(read_innovations(tmp_path / "log.npz"), cs.Monitor()).alarm
+    assert (whole.outlier, whole.rest) == (before + 1, 1.0)
+    assert "overconfident since" not in str(whole)
+    assert "that of the others x1," in str(whole)
+
+
+@pytest.mark.parametrize("scale", [3.0, 8.0, 24.5])
+def test_a_fault_with_outliers_keeps_its_beginning(scale):
+    """Each NIS is ``scale`` from step 101 on, but for one of 200: what is left since then is a fault by itself."""
+    monitor = cs.Monitor()
+    (alarm,) = fed(monitor, [1.0] * 100 + [scale] * 2 + [200.0] + [scale] * 60, 1)
+    assert f"overconfident since step {alarm.since}; scale" in str(alarm)
+    assert alarm.outlier in (None, 103)
+    assert alarm.outlier is None or alarm.rest == pytest.approx(scale)
+    assert alarm.since == 101
+
+
+def test_a_conservative_alarm_has_no_outlier():
+    (alarm,) = fed(cs.Monitor(), [0.05] * 400, 1)
+    assert (alarm.direction, alarm.outlier) == ("conservative", None)
+    assert "outlier" not in str(alarm)

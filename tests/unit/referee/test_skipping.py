@@ -270,11 +270,50 @@ def test_a_bias_of_the_first_steps_is_named(rng):
 def test_no_hint_where_a_fault_remains(rng):
     """Half of the fault is left, or a later step has one too, or the fault is in the later steps."""
     for scale in (np.r_[np.full(8, 9.0), np.full(56, 2.5)], np.r_[9.0, np.ones(40), 9.0, np.ones(22)],
-                  np.r_[np.ones(32), np.full(32, 9.0)], np.r_[np.full(40, 9.0), np.ones(24)]):  # fmt: skip
+                  np.r_[np.ones(32), np.full(32, 9.0)]):  # fmt: skip
         error = independent(rng, 100, 64, 3) * np.sqrt(scale)[:, None]
         verdict = verdict_on(error, false_alarm=SURE)
         assert verdict.faults
         assert verdict.location.until is None
+
+
+def test_no_start_to_skip_is_more_than_half(rng):
+    """The end of a fault in 40 of 64 steps is named; leaving these out is no advice."""
+    verdict = verdict_on(independent(rng, 100, 64, 3) * np.sqrt(np.r_[np.full(40, 9.0), np.ones(24)])[:, None])
+    assert verdict.location.until.step == 40
+    assert verdict.location.since is None
+    said = [reason for reason in verdict.reasons if "the fault is in the first 40 steps only" in reason]
+    assert len(said) == 1
+    assert "--skip" not in said[0]
+
+
+@pytest.mark.parametrize("ratio", [1.0 / 6.0, 2.0, 4.0])
+@pytest.mark.parametrize("first, last", [(21, 40), (4, 8), (12, 12), (5, 46)])
+def test_a_fault_that_begins_and_ends_is_named_by_both(first, last, ratio, rng):
+    """Ends are exact but for one step of x2 in 200 runs, whose likelihood a neighbour exceeds with less than 1e-3."""
+    error = independent(rng, 200, 50, 3)
+    error[:, first - 1 : last] *= np.sqrt(ratio)
+    verdict = verdict_on(error, false_alarm=SURE)
+    where = f"steps {first} to {last}" if first < last else f"step {first}"
+    assert (verdict.statistics["since"], verdict.statistics["until"]) == (first, last)
+    assert verdict.inflation == pytest.approx(ratio, rel=0.3)
+    assert verdict.location.until.late.value == pytest.approx(1.0, abs=0.1)
+    assert f" in {where}" in verdict.reasons[0]
+    assert any(reason.startswith(f"the fault is in {where} only; in the others ") for reason in verdict.reasons)
+    assert "--skip" not in " ".join(verdict.reasons)
+
+
+def test_the_place_of_a_fault_where_steps_depend(rng):
+    """AR(0.9): late faults have no end, a fault in the middle does not begin at the start, and ends are near."""
+    for begin, end in ((50, 100), (80, 100), (20, 60), (60, 70)):
+        for ratio in (2.0, 4.0):
+            error = autoregression(rng, 40, 100, 6, 0.9)
+            error[:, begin:end] *= np.sqrt(ratio)
+            verdict = verdict_on(error)
+            assert "in the first" not in " ".join(verdict.reasons)
+            until = verdict.location.until
+            assert (until is None) or (end < 100 and abs(until.step - end) <= 4)
+            assert until is None or abs(verdict.location.since - begin - 1) <= 4
 
 
 def test_no_hint_of_few_runs_or_a_single_step(rng):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.fault_location import from_step, location_of
+from consistency.referee.diagnostics.judging.fault_location import location_of
 from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
 from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
 from consistency.referee.diagnostics.questions.bias import hotelling
@@ -146,7 +146,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
         of_log = within(sample.nees[0], dof, settings, shown.factor)
     late = means
     if location.since is not None:
-        late = sample.means(from_step(location.since))
+        late = sample.means(location.steps)
     return Scale(
         dof=dof,
         anees=curve,
@@ -167,7 +167,7 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
 
 def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
     """Inflation of each component and group, and of velocity, since the fault began."""
-    late = from_step(location.since)
+    late = location.steps
     confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
     reported = sample.reported
     inflation = {}
@@ -226,7 +226,7 @@ def _status_of_group(ratio: float, is_wrong: bool, shown: Equivalence) -> str:
 
 def bias_of(sample: Sample, step: int | None, location: Location, faults: set[str]) -> Bias:
     """Mean error of each axis, clearest in ``step``, and the scale without it."""
-    late = from_step(location.since)
+    late = location.steps
 
     def means(error: Array, covariance: Array, counted: Array) -> Array:
         return mean_of_runs(np.where(counted[..., None], standardise(error, covariance), np.nan))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
@@ -11,18 +13,14 @@ from consistency.referee.diagnostics.questions.scale import pointwise_band, rati
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.verdict.answers import BIAS, MAIN, SCALE, STEP
-from consistency.referee.diagnostics.verdict.parts import Location, Until
+from consistency.referee.diagnostics.verdict.parts import TINY, Interval, Location, Until
 from consistency.referee.types import Array, Indices
 
 FEWEST = 8  # runs; with fewer the axes are not told apart
-SURE = 0.04  # false-alarm rate of naming an axis, or a beginning, that does not stand out
-
-
-def from_step(since: int | None) -> slice:
-    """Steps from ``since`` (1..T) on; all where it is None."""
-    if since is None:
-        return slice(0, None)
-    return slice(since - 1, None)
+SURE = 0.04  # false-alarm rate of naming an axis, a beginning or an end that does not stand out
+NEAR = 0.1  # of a fault's length, by which its ends may differ between two halves of the runs, or one step
+TURNS = 10  # of moving both ends; they settle after two or three
+APART = 0.25  # of a fault's length, from which on the steps before it do not belong to it
 
 
 def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, detect: float) -> Location:
@@ -34,7 +32,7 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
     ordered : steps follow each other; otherwise a fault has no beginning or end
     detect : that of the settings, as a factor above 1
     """
-    first_outside = first_step = since = subset = last = None
+    first_outside = first_step = since = last = None
     lasting = False
     if band.outside.any():
         first = int(np.argmax(band.outside))
@@ -45,11 +43,15 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
                 lasting = _is_lasting(sample, band, first)
             if lasting and _absent_before(sample, first, band.above[first]):
                 since = first_step
-    if sample.whitened is not None and faults & set(SCALE):
-        subset = chief_axes(sample, from_step(since), MAIN in faults)
     if ordered and faults & {*SCALE, *BIAS}:
-        last = until(sample, band, detect)
-    return Location(
+        stretch = _stretch(sample, detect)
+        begins = _begins_late(sample, stretch)
+        last = _end_of(sample, band, detect, stretch)
+        if begins is not None and last is not None:
+            since = begins
+        else:
+            last = until(sample, band, detect, stretch) or last
+    where = Location(
         simultaneous=np.stack([band.low, band.high], axis=-1),
         steps_above=int(band.above.sum()),
         steps_below=int(band.below.sum()),
@@ -57,9 +59,11 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
         first_step=first_step,
         since=since,
         lasting=lasting,
-        subset=subset,
         until=last,
     )
+    if sample.whitened is None or not faults & set(SCALE):
+        return where
+    return replace(where, subset=chief_axes(sample, where.steps, MAIN in faults))
 
 
 def _is_lasting(sample: Sample, band: Band, first: int) -> bool:
@@ -91,36 +95,160 @@ def _absent_before(sample: Sample, first: int, above: bool) -> bool:
     return bool(upper < 0.5 * log_late)
 
 
-def until(sample: Sample, band: Band, detect: float) -> Until | None:
+def until(sample: Sample, band: Band, detect: float, stretch: slice | None = None) -> Until | None:
     """The first steps that alone carry the fault, or None.
 
-    They are 1, 2, 4, ... steps from the first judged one on, at most half of all. With the means a_i over them and b_i
-    over the others of run i, the fault of the others is shown to be less than half of theirs, on the logarithm:
-    D_i = b_i / mean b - a_i / (2 mean a) has the standard error of log mean b - log(mean a) / 2 to first order;
-    Student's t over runs, Bonferroni over the numbers of steps and both signs. A fault that is the same in all steps
-    is said to be in the first ones with probability ``SURE`` at most. Nothing is left of the fault afterwards: the
-    interval of the ratio holds 1 or lies within [1 / detect, detect], and no step is outside the band on that side.
+    They are 1, 2, 4, ... steps from the first judged one on, at most half of all, and are themselves shown to be at
+    fault. The fault of the others is shown to be less than half of theirs (:func:`_less_than_half`, Bonferroni over the
+    numbers of steps and both signs): a fault that is the same in all steps is said to be in the first ones with
+    probability ``SURE`` at most. Nothing is left of it afterwards (:func:`_is_right`), and no step is outside the band.
+    Where the fault is in a ``stretch`` of steps, it has to begin with the first ones and to end among them.
     """
     ends, early, late = _splits(sample)
     if len(early) < FEWEST or not len(ends):
         return None
-    bar = float(distributions.t.isf(SURE / (2.0 * len(ends)), len(early) - 1)) / np.sqrt(len(early))
+    least = 0
+    if stretch is not None:
+        least = stretch.stop
+        before = stretch.start - int(np.argmax(sample.counted.any(axis=0)))
+        if before > APART * (stretch.stop - stretch.start):
+            return None
     for end, a, b in zip(ends, early.T, late.T, strict=True):
-        if not a.mean() > 0 or not b.mean() > 0:
-            continue
-        sign = -1.0
-        outside = band.below
-        if a.mean() > 1.0:
-            sign = 1.0
-            outside = band.above
-        left = sign * (np.log(b.mean()) - 0.5 * np.log(a.mean()))
-        error = float((b / b.mean() - 0.5 * a / a.mean()).std(ddof=1))
-        if left + bar * error >= 0.0 or outside[end:].any():
+        if end < least or band.outside[end:].any() or not _less_than_half(b, a, SURE / (2.0 * len(ends))):
             continue
         rest = ratio_interval(b, sample.dof, CONFIDENCE)
-        if rest.holds(1.0) or (rest.low >= 1.0 / detect and rest.high <= detect):
+        if _is_right(rest, detect) and not ratio_interval(a, sample.dof, CONFIDENCE).holds(1.0):
             return Until(int(end), float(a.mean()), rest)
     return None
+
+
+def _less_than_half(rest: Array, inside: Array, rate: float) -> bool:
+    """Whether the fault of the ``rest`` is shown to be less than half of that ``inside``, on the logarithm.
+
+    With the means a_i inside and b_i over the rest of run i, both (runs,), D_i = b_i / mean b - a_i / (2 mean a) has
+    the standard error of log mean b - log(mean a) / 2 to first order; Student's t over runs, one-sided at ``rate``.
+    """
+    if not inside.mean() > 0 or not rest.mean() > 0:
+        return False
+    left = np.log(rest.mean()) - 0.5 * np.log(inside.mean())
+    if inside.mean() < 1.0:
+        left = -left
+    error = float((rest / rest.mean() - 0.5 * inside / inside.mean()).std(ddof=1)) / np.sqrt(len(rest))
+    return bool(left + float(distributions.t.isf(rate, len(rest) - 1)) * error < 0.0)
+
+
+def _is_right(ratio: Interval, detect: float) -> bool:
+    """Whether the interval of a ratio holds 1, or lies within [1 / detect, detect]."""
+    return ratio.holds(1.0) or (ratio.low >= 1.0 / detect and ratio.high <= detect)
+
+
+# --- a stretch of steps ------------------------------------------------------------------------------
+
+
+def _stretch(sample: Sample, detect: float) -> slice | None:
+    """The stretch of steps that a fault is in, where two halves of the runs agree on it; None with fewer than 16 runs.
+
+    Its ends may be the first and the last step.
+    """
+    halves = [sample.nees[half::2] for half in (0, 1)]
+    if min(len(half) for half in halves) < FEWEST:
+        return None
+    found = [_likeliest_stretch(nees, sample.dof, detect) for nees in (sample.nees, *halves)]
+    whole, one, other = found
+    if whole is None or one is None or other is None:
+        return None
+    near = max(1.0, NEAR * (whole.stop - whole.start))
+    if max(abs(one.start - other.start), abs(one.stop - other.stop)) > near:
+        return None
+    return whole
+
+
+def _likeliest_stretch(nees: Array, dof: int, detect: float) -> slice | None:
+    """The steps a to b - 1 with the likelihood ratio that is largest, of one ratio in them against 1; None without any.
+
+    For K degrees of freedom with the mean ratio r in them it is K / 2 (r - 1 - log r), as if steps were independent;
+    each end in turn takes its best place beside the other. The search begins where the ratios exceed sqrt(detect) most
+    in total, and where they are short of its inverse.
+
+    Parameters
+    ----------
+    nees : (runs, steps)
+    """
+    count = np.isfinite(nees).sum(axis=0)
+    judged = np.flatnonzero(count)
+    weight = count[judged] * float(dof)
+    ratio = anees(nees)[judged] / dof
+    total = np.append(0.0, np.cumsum(weight * ratio))
+    K = np.append(0.0, np.cumsum(weight))
+    places = np.arange(len(K))
+
+    def gain(a: Indices | int, b: Indices | int) -> Array:
+        r = np.maximum((total[b] - total[a]) / (K[b] - K[a]), TINY)
+        return np.asarray(0.5 * (K[b] - K[a]) * (r - 1.0 - np.log(r)))
+
+    best = 0.0
+    stretch = None
+    for edge, sign in ((np.sqrt(detect), 1.0), (1.0 / np.sqrt(detect), -1.0)):
+        excess = sign * (total - edge * K)
+        b = int(np.argmax(excess - np.minimum.accumulate(excess)))
+        a = int(np.argmin(excess[: b + 1]))
+        if a == b:
+            continue
+        for _ in range(TURNS):
+            b = a + 1 + int(np.argmax(gain(a, places[a + 1 :])))
+            a = int(np.argmax(gain(places[:b], b)))
+        if gain(a, b) > best:
+            best = float(gain(a, b))
+            stretch = slice(int(judged[a]), int(judged[b - 1]) + 1)
+    return stretch
+
+
+def _begins_late(sample: Sample, stretch: slice | None) -> int | None:
+    """The first step of a stretch, 1..T; None without one, and where it is the first that is judged."""
+    if stretch is None or not sample.counted[:, : stretch.start].any():
+        return None
+    return int(stretch.start) + 1
+
+
+def _end_of(sample: Sample, band: Band, detect: float, stretch: slice | None) -> Until | None:
+    """The last step of a stretch that alone carries the fault, or None where that is not shown.
+
+    The fault is shown to be less than half as large after it, and before it where steps are, in each half of the runs
+    by the ends that are found in the other half. So a fault that is the same in all steps is said to have an end with
+    probability ``SURE`` at most, however the ends are chosen. What remains is as in :func:`until`.
+    """
+    if stretch is None or not sample.counted[:, stretch.stop :].any():
+        return None
+    halves = [sample.nees[half::2] for half in (0, 1)]
+    for nees, other in zip(halves, halves[::-1], strict=True):
+        ends = _likeliest_stretch(other, sample.dof, detect)
+        assert ends is not None
+        for rest in (nees[:, : ends.start], nees[:, ends.stop :]):
+            if not np.isfinite(rest).any():
+                continue
+            means, of_rest = run_means(rest)
+            inside, of_stretch = run_means(nees[:, ends])
+            both = (of_rest > 0) & (of_stretch > 0)
+            if both.sum() < FEWEST or not _less_than_half(means[both] / sample.dof, inside[both] / sample.dof, SURE):
+                return None
+    if band.outside[: stretch.start].any() or band.outside[stretch.stop :].any():
+        return None
+    ratio = ratio_interval(sample.means(stretch), sample.dof, CONFIDENCE)
+    others = ratio_interval(_means_beside(sample, stretch), sample.dof, CONFIDENCE)
+    if not _is_right(others, detect) or ratio.holds(1.0):
+        return None
+    return Until(stretch.stop, ratio.value, others)
+
+
+def _means_beside(sample: Sample, stretch: slice) -> Array:
+    """Mean NEES over dof of each run that has steps before or after a stretch, over these, (runs,)."""
+    means, counts = np.stack([run_means(sample.nees[:, : stretch.start]), run_means(sample.nees[:, stretch.stop :])], 1)
+    count = counts.sum(axis=0)
+    total = np.where(counts > 0, means * counts, 0.0).sum(axis=0)
+    return np.asarray(total[count > 0] / count[count > 0] / sample.dof)
+
+
+# --- first steps, and axes ---------------------------------------------------------------------------
 
 
 def _splits(sample: Sample) -> tuple[Indices, Array, Array]:

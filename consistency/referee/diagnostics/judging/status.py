@@ -227,14 +227,33 @@ def _status_of_steps(settings: Settings, faults: set[str], sample: Sample, tests
 
 
 def _heavy_steps(sample: Sample, tests: Tests) -> bool:
-    """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?"""
+    """Do the runs differ more than Gaussian errors can, in most steps, or in all of those outside the band?
+
+    Where steps are above the band these alone count: errors that are too small have no heavy tails.
+    """
     if spreads_more_in_steps(sample.nees, sample.dof):
         return True
-    outside = np.flatnonzero(tests.band.outside)
+    outside = np.flatnonzero(tests.band.above).tolist()
+    if not outside:
+        outside = np.flatnonzero(tests.band.below).tolist()
     for step in outside:
-        if not spreads_more(sample.nees[sample.counted[:, step], step] / sample.dof, sample.dof, SURE):
+        if not spreads_more(sample.nees[sample.counted[:, step], step] / sample.dof, _rank(sample, step), SURE):
             return False
-    return len(outside) > 0
+    return bool(outside)
+
+
+def _rank(sample: Sample, step: int) -> float:
+    """Degrees of freedom with which the NEES of a step spreads if errors are Gaussian, of whatever covariance.
+
+    (tr S)^2 / tr S^2 with S that of the whitened errors, as if all axes were off by one factor where it is n. Of the
+    second moment M of N runs, tr M^2 exceeds tr S^2 by (tr M)^2 / N.
+    """
+    if sample.whitened is None:
+        return sample.dof
+    w = sample.whitened[sample.counted[:, step], step]
+    M = w.T @ w / len(w)
+    square = float(np.trace(M)) ** 2
+    return float(np.clip(square / max(float(np.square(M).sum()) - square / len(w), TINY), 1.0, sample.dof))
 
 
 def _robust(

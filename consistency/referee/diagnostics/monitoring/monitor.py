@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit
 RATIOS = (1.1, 1.25, 1.5, 2.0, 4.0)  # of an alternative to the edge of the tolerance
 SERIES = 2.10975  # rounded up from 2.109743, the sum of 1 / (n ln^2 n) over n >= 2: the shares add up to less than 1
 RESTS = ((0.99, 2), (0.95, 5))  # share that the gate accepts, at least; innovations not judged after a rejection
-FAR = 1e-9  # probability that an innovation of a right filter is as large as an outlier
+FAR = 1e-6  # probability that an innovation of a right filter is as large as an outlier
 LARGEST = 1e300  # evidence is cut off here, which is on the safe side
 EXPONENT = 690.0  # exp() of it is just below LARGEST
 CAVEAT = (
@@ -30,9 +30,11 @@ class _Reset(NamedTuple):
     nis: float
     dof: int
     innovations: int
+    rest_nis: float  # without outliers
+    rest_dof: int
 
 
-START = _Reset(1, 0.0, 0, 0)
+START = _Reset(1, 0.0, 0, 0, 0.0, 0)
 
 
 @dataclass(frozen=True)
@@ -51,19 +53,26 @@ class Alarm:
     scale: float  # of the NIS since then: innovation covariance over the stated one; inf if a gate hides how much
     false_alarm: float
     tolerance: float
-    rest: float = math.nan  # where the NIS of this step is an outlier: NIS over degrees of freedom of all before
+    outlier: int | None = None  # step of the last NIS since then that is an outlier
+    rest: float = math.nan  # beside an outlier, NIS over degrees of freedom of the others: since then, or before
 
     def __str__(self) -> str:
         size = f"x{self.scale:.3g}"
-        others = ""
         if math.isinf(self.scale):
             size = "larger than a gate lets see"
-        if self.rest > 0:
-            others = f"; the NIS of this step is an outlier, and that of all before x{self.rest:.3g}"
+        what = f"{self.direction} since step {self.since}; scale of the NIS since then {size}"
+        others = ""
+        if self.outlier is not None:
+            which = "this step" if self.outlier == self.step else f"step {self.outlier}"
+            rest = f"that of the others x{self.rest:.3g}"
+            if math.isnan(self.rest):
+                rest = "nothing is known of others yet"
+            others = f"; the NIS of {which} is an outlier, and {rest}"
+            if not self.rest > self.tolerance:
+                what = f"scale of the NIS since step {self.since} {size}"
         return (
-            f"alarm in step {self.step}: {self.direction} since step {self.since}; scale of the NIS since then {size} "
-            f"({accepted_scales(self.tolerance)}){others}, e-value {self.evidence:.3g} "
-            f"(alarm at {1 / self.false_alarm:.4g}). {CAVEAT}."
+            f"alarm in step {self.step}: {what} ({accepted_scales(self.tolerance)}){others}, e-value "
+            f"{self.evidence:.3g} (alarm at {1 / self.false_alarm:.4g}). {CAVEAT}."
         )
 
 
@@ -212,8 +221,10 @@ class Monitor:
         self.steps = self.measurements = self.rejections = self.innovations = 0
         self.evidence = self.largest = 1.0
         self.alarm: Alarm | None = None
-        self._nis = 0.0
-        self._dof = 0
+        self._nis = self._rest_nis = 0.0
+        self._dof = self._rest_dof = 0
+        self._outlier = 0  # the step of the last one
+        self._fault = START  # the reset from which the alarm counts
         self._unspent = 1.0  # 1 - (p_1 + ... + p_t)
         self._skip = 0  # accepted innovations still not to be judged
         self._R = [0.0] * count
@@ -267,16 +278,19 @@ class Monitor:
         if self.alarm is not None or self.evidence < self.threshold:
             return None
         best = max(range(len(self._R)), key=self._R.__getitem__)
-        reset = self._resets[best]
+        reset = self._fault = self._resets[best]
         direction = "conservative"
+        outlier = None
         rest = math.nan
         if best < len(RATIOS):
             direction = "overconfident"
-        if value > bet.far and self._dof > dof:
-            rest = (self._nis - value) / (self._dof - dof)
+            all_are = self._rest_dof == reset.rest_dof and self.innovations > reset.innovations + 1
+            if self._outlier >= reset.step and not all_are:
+                outlier = self._outlier
+                rest = self.rest
         self.alarm = Alarm(
             self.steps, reset.step, direction, self.evidence, self._scale_since(reset), self.false_alarm,
-            self.tolerance, rest,
+            self.tolerance, outlier, rest,
         )  # fmt: skip
         return self.alarm
 
@@ -293,6 +307,19 @@ class Monitor:
         return self._nis / self._dof
 
     @property
+    def rest(self) -> float:
+        """:attr:`ratio` without outliers, since the fault of the alarm; of all where no others are there since.
+
+        NaN without any. Innovations after the alarm count as well.
+        """
+        if not self._rest_dof:
+            return math.nan
+        reset = self._fault
+        if self._rest_dof == reset.rest_dof:
+            reset = START
+        return (self._rest_nis - reset.rest_nis) / (self._rest_dof - reset.rest_dof)
+
+    @property
     def scale(self) -> float:
         """Scale of the NIS over all that was judged: ``ratio``, corrected for what the gate cuts off."""
         if not self._dof:
@@ -303,11 +330,16 @@ class Monitor:
         self.innovations += 1
         self._nis += nis
         self._dof += dof
+        if nis > bet.far:
+            self._outlier = self.steps
+        else:
+            self._rest_nis += nis
+            self._rest_dof += dof
         share = start_share(self.innovations, self.mission)
         self._unspent = max(self._unspent - share, 0.0)
         R = self._R
         cusum = self._cusum
-        here = _Reset(self.steps + 1, self._nis, self._dof, self.innovations)
+        here = _Reset(self.steps + 1, self._nis, self._dof, self.innovations, self._rest_nis, self._rest_dof)
         total = 0.0
         for i, (constant, slope) in enumerate(bet.terms):
             log_ratio = constant + slope * nis

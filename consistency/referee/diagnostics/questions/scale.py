@@ -129,7 +129,7 @@ def weighted_of(means: Array, weights: Array | None = None) -> Weighted:
     return Weighted(ratio, ratio + w * (means - ratio), float(np.square(w).mean()), float((w**3).mean()), w)
 
 
-def spreads_more(means: Array, dof: int, errors: float = 1.0) -> bool:
+def spreads_more(means: Array, dof: float, errors: float = 1.0) -> bool:
     """Whether run means (runs,) differ more than those of Gaussian errors can, for which nu is ``dof`` at least.
 
     Either estimate of nu (:func:`scale_test`) lies more than ``errors`` standard errors below; not asked of fewer than

@@ -259,11 +259,11 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Until:
-    """The last of the first steps that carry a fault, 1..T, and the ratio in these steps and after them."""
+    """The last of the steps that carry a fault, 1..T, and the ratio in these steps and in the others."""
 
     step: int
     early: float  # mean NEES over dof
-    late: Interval  # ratio of true to stated covariance, 95 %
+    late: Interval  # ratio of true to stated covariance in the other steps, 95 %
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,14 @@ class Location:
     since: int | None = None  # the fault begins there: it was absent before
     lasting: bool = False  # most steps from there on are outside
     subset: str | None = None  # axes that carry the fault, where axes differ from each other
-    until: Until | None = None  # the fault is in the first steps only
+    until: Until | None = None  # the fault ends there: it is in the first steps only, or in those from ``since`` on
+
+    @property
+    def steps(self) -> slice:
+        """Steps of a fault that begins late, up to its end; all where it does not begin late."""
+        if self.since is None:
+            return slice(0, None)
+        return slice(self.since - 1, self.until and self.until.step)
 
 
 @dataclass(frozen=True)

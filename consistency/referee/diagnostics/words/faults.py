@@ -17,6 +17,7 @@ from consistency.referee.diagnostics.words.numbers import (
     plural,
     ratio_text,
     short,
+    since_text,
 )
 from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
@@ -44,13 +45,13 @@ def scale_text(v: Findings) -> str:
     contrary = SIDES.get(v.status, 0) * (inflation.value - 1.0) < 0.0
     if about and contrary:
         return f"covariance{about} {_side(SIDES[v.status])} in some {v.places}"
-    if MAIN not in v.faults and (contrary or not v.location.lasting):
+    if MAIN not in v.faults and (contrary or not (v.location.lasting or v.location.since)):
         return _steps_text(v)
     if contrary:
         ratio = v.scale.mean_anees / v.scale.dof
         return f"covariance {off_by_factor(ratio)} in the mean of all {v.places}"
     size, note = _size_and_note(v, inflation)
-    text = f"covariance{about} {size}{_since(v)}"
+    text = f"covariance{about} {size}{since_text(v)}"
     factors = ""
     if not about:
         factors = factors_text(v)
@@ -100,12 +101,6 @@ def _first_visible(v: Findings) -> str:
     if where.first_step <= int(np.argmax(v.scale.alive > 0)) + 1:
         return ""
     return f", first visible in {v.place(where.first_step)}"
-
-
-def _since(v: Findings) -> str:
-    if v.location is None or v.location.since is None:
-        return ""
-    return f" since {v.place(v.location.since)}"
 
 
 def _side(sign: float) -> str:
@@ -178,7 +173,7 @@ def _axes_text(v: Findings) -> str:
         return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
     if not off:
         return "covariance wrong in an axis"
-    return f"covariance {_sizes_in_axes(off)}{_since(v)}"
+    return f"covariance {_sizes_in_axes(off)}{since_text(v)}"
 
 
 def _direction_text(v: Findings) -> str:
@@ -201,7 +196,7 @@ def _correlation_text(v: Findings) -> str:
     if v.shape is None:
         return text
     worst = float(np.linalg.eigvalsh(v.shape.matrix)[-1]) * v.scale.mean_anees / v.scale.dof
-    return f"{text}, but {off_by_factor(worst)} in one direction{_since(v)}"
+    return f"{text}, but {off_by_factor(worst)} in one direction{since_text(v)}"
 
 
 # --- bias, shape, tails, maps --------------------------------------------------------------------------
@@ -230,6 +225,8 @@ def bias_text(v: Findings, in_steps: bool) -> str:
 
 
 def _sigmas(value: float) -> str:
+    if 0.0 < abs(value) < 0.01:
+        return f"{value:+.2g}"
     if abs(value) < 100.0:
         return f"{value:+.2f}"
     return f"{value:+.1e}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from consistency.referee.diagnostics.verdict.parts import TINY, Interval
+from consistency.referee.diagnostics.verdict.verdict import Findings
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 SIDE = len("too small")  # or "too large", with which :func:`off_by` begins
@@ -59,6 +60,16 @@ def ratio_text(interval: Interval) -> str:
 def is_uncertain(interval: Interval) -> bool:
     """Whether an interval is so wide that it says nothing, or only that a ratio is above its lower end."""
     return not interval.high < UNCERTAIN * interval.low
+
+
+def since_text(v: Findings) -> str:
+    """Where a fault is that begins late: " since step 21", or " in steps 21 to 40" where it ends; '' otherwise."""
+    where = v.location
+    if where is None or where.since is None:
+        return ""
+    if where.until is None:
+        return f" since {v.place(where.since)}"
+    return f" in {v.places_between(where.since, where.until.step)}"
 
 
 def p_text(p: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,11 +26,13 @@ from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Conven
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
     is_or_are,
+    is_uncertain,
     p_text,
     percent,
     plural,
     ratio_text,
     short,
+    since_text,
 )
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -61,11 +64,21 @@ def _faults_of_parts(v: Findings) -> str:
     texts = []
     for name, part in v.parts.items():
         if part.faults:
+            part = _at_one_level(v, name, part)
             sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
             texts.append(f"{name}: {sentence}")
     if len(texts) > MOST:
         texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
     return "; ".join(texts)
+
+
+def _at_one_level(v: Findings, name: str, part: Findings) -> Findings:
+    """A part of one axis with the ratio that the whole states of that axis, whose intervals hold at once."""
+    if v.axes is None or name not in v.axes.names or part.scale is None:
+        return part
+    if part.location is not None and part.location.since is not None:
+        return part
+    return replace(part, scale=replace(part.scale, inflation=v.axes.inflation[name]))
 
 
 def details(v: Findings) -> list[str]:
@@ -155,14 +168,22 @@ def _first_steps(v: Findings) -> list[str]:
     if v.location is None or v.location.until is None:
         return []
     until = v.location.until
+    if v.location.since is not None:
+        where = v.places_between(v.location.since, until.step)
+        return [f"the fault is in {where} only; in the others the covariance ratio is {ratio_text(until.late)}"]
     where = "the first step"
     if until.step > 1:
         where = f"the first {until.step} steps"
-    return [
+    text = (
         f"the fault is in {where} only, where the covariance ratio is {short(until.early)}; after that it is "
-        f"{ratio_text(until.late)}. If the start is not meant to count, state --skip {until.step} (skip={until.step} "
-        "in a gate) and judge other runs by it"
-    ]
+        f"{ratio_text(until.late)}"
+    )
+    if v.scale is not None and 2 * until.step <= len(v.scale.alive):
+        text += (
+            f". If the start is not meant to count, state --skip {until.step} (skip={until.step} in a gate) and judge "
+            "other runs by it"
+        )
+    return [text]
 
 
 def _no_fault(v: Findings, s: Scale) -> str:
@@ -287,10 +308,13 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         )
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
+    if not v.faults:
+        lines += _two_intervals(s)
     worst = clear(v.worst_axis)
     of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
-        lines.append(f"covariance ratio of the worst axis: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
+        where = since_text(v)
+        lines.append(f"covariance ratio of the worst axis{where}: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
         from consistency.referee.diagnostics.words.faults import combination_text
 
@@ -312,6 +336,20 @@ def _levels(v: Findings, s: Scale) -> list[str]:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
         lines += [f"{name}: {line}" for line in _groups(part.by_group, v.unit)]
     return lines
+
+
+def _two_intervals(s: Scale) -> list[str]:
+    """That the interval of the tests is not that of the ratio, where it is the wider one at the lower level."""
+    tests = s.equivalence.interval
+    if tests is None or s.equivalence.one_sided or not s.inflation.high > 0.0:
+        return []
+    low, high = s.inflation[1:]
+    if (tests[0] >= low and tests[1] <= high) or is_uncertain(s.inflation):
+        return []
+    return [
+        f"95 % interval {short(low)} to {short(high)} by the spread between these runs; that of the two tests is wider "
+        "where it also holds if the covariance is right in some runs only"
+    ]
 
 
 def _groups(by: ByGroup | None, unit: str) -> list[str]:
@@ -357,19 +395,22 @@ def _single_log(v: Findings, s: Scale) -> list[str]:
     """Ratio of a single run, and the data that would decide."""
     if v.runs != 1 or v.landmarks is not None or v.unit != "run":
         return []
+    undecided = v.status == "undecided"
+    if s.within is None and not undecided:
+        return []
     if s.within is None:
         return [
             "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
         ]
-    return [_ratio_within(s.within, s.judged_steps)]
+    return [_ratio_within(s.within, s.judged_steps, undecided)]
 
 
-def _ratio_within(w: Within, steps: int) -> str:
+def _ratio_within(w: Within, steps: int, undecided: bool) -> str:
     text = (
         f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio "
         f"is {ratio_text(w.ratio)}, reported and not judged"
     )
-    if w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
+    if not undecided or w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
         return text
     if w.steps <= steps:
         return f"{text}; cut into {w.pieces} runs, this log would then probably decide"

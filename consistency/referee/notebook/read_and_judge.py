@@ -63,8 +63,8 @@ def read(
         memory, as a DataFrame, with the columns of a .csv
     truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory: t and 36 or 21 numbers
-    error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default,
-        and "guess" judges all that poses have
+    error : error that the covariance describes: so2, vector, left, right, so3, so3-body, rvec or euler; None is
+        the default, and "guess" judges all that poses have
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
     covariance_order : translation-rotation or rotation-translation, or blocks in their order, as p,v,R; of a trajectory
     max_dt : s, between an estimate and its truth; None is 0.01

@@ -53,6 +53,7 @@ def read(
     body_axes: str | None = None,
     truth_world: str | None = None,
     truth_body_axes: str | None = None,
+    dof: int | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -91,6 +92,7 @@ def read(
     columns, truth_columns : names of columns here and in the file: ``{"x": "pos_n", "P*": "cov_*"}``
     world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
         A pose maps from its body axes to its world axes
+    dof : degrees of freedom of each NIS of a table that has no column of them
     filter : which estimator, where the files hold several
 
     Raises
@@ -106,7 +108,7 @@ def read(
         true, stated, error, state, covariance_order, max_dt, time_offset, axes, topic, truth_topic, body, relative,
         motions or None, windows, align, lever_arm, split, of_truth, truth_errors,
         truth_shared or None, by, None if by_file is None else Path(by_file), bins, columns, truth_columns, world,
-        body_axes, truth_world, truth_body_axes,
+        body_axes, truth_world, truth_body_axes, dof=dof,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

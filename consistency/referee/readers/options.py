@@ -135,6 +135,7 @@ class Reading:
     body_axes: str | None = _option("Axes of the body of the estimates: flu [default], frd ...", "AXES")
     truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
+    dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

@@ -131,11 +131,11 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES), _bags),
-    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
+    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),
+    Kind(_is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
 )
 
 

@@ -23,7 +23,6 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.monitoring.monitor import Alarm
     from consistency.referee.readers.formats.innovation_files import NisLog
 
 
@@ -88,11 +87,7 @@ def monitor_command(
         options = given_options(filter=filter_name, run=run, skip=skip, plot=plot)
         if options:
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
-
-        def say(alarm: Alarm) -> None:
-            print(alarm, file=sys.stderr, flush=True)
-
-        watched = watch_lines(sys.stdin, "stdin", watcher, say, files)
+        watched = watch_lines(sys.stdin, "stdin", watcher, partial(print, file=sys.stderr, flush=True), files)
     else:
         log = without_first(_read_innovations(Path(path), filter_name, run, files), first)
         tell(log.notes)

@@ -203,22 +203,21 @@ def require_layout(key: str, e: tuple[int, ...], P: tuple[int, ...], where: str 
         return
     n = e[-1]
     full = (*e, n)
-    covariances = "covariances"
     remedy = ""
     if (e[0], *e) == P and len(P) > 2:
-        remedy = f"components come first: np.moveaxis({key}, 0, -1) and np.moveaxis({covariances}, (0, 1), (-2, -1)) " \
+        remedy = f"components come first: np.moveaxis({key}, 0, -1) and np.moveaxis(covariances, (0, 1), (-2, -1)) " \
                  "put them behind runs and steps"  # fmt: skip
     elif n == 1 and (*e[:-1], e[-2]) == P:
         remedy = f"a state is a column, (n, 1): take {key}[..., 0]"
     elif n > 1 and (*e[:-1], n * n) == P:
-        remedy = f"each matrix is a row of {n * n} numbers: {covariances}.reshape({full})"
+        remedy = f"each matrix is a row of {n * n} numbers: covariances.reshape({full})"
     elif e == P:
-        remedy = f"variances are {covariances}[..., None] * np.eye({n})"
+        remedy = f"variances are covariances[..., None] * np.eye({n})"
         remedy += "" if where else ", standard deviations go into deviations="
     elif len(e) == 3 and e[0] > 1 and P in (full[1:], full[2:]):
-        remedy = f"one for all is np.broadcast_to({covariances}, {full})"
+        remedy = f"one for all is np.broadcast_to(covariances, {full})"
     if remedy:
-        raise InputError(f"{where}{key} has shape {e} and {covariances} {P}; needed are (runs, steps, n) and "
+        raise InputError(f"{where}{key} has shape {e} and covariances {P}; needed are (runs, steps, n) and "
                          f"(runs, steps, n, n); {remedy}")  # fmt: skip
 
 
@@ -239,10 +238,9 @@ def swapped(name: str, errors: Array) -> list[str]:
 
 def _lag(e: Array, axis: int) -> float:
     """Mean correlation of errors (runs, steps, n) with their neighbours along an axis, over components."""
-    count = e.shape[axis]
-    after, before = (np.take(e, range(first, count - 1 + first), axis) for first in (1, 0))
+    e = np.moveaxis(e, axis, 0)
     size = np.square(e).mean(axis=(0, 1))
-    together = (after * before).mean(axis=(0, 1))
+    together = (e[1:] * e[:-1]).mean(axis=(0, 1))
     return float(np.mean(together / np.where(size > 0, size, 1.0)))
 
 

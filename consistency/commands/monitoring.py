@@ -9,14 +9,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from consistency.commands.shared_options import AsJson, given_options, print_document, require_word, tell
+from consistency.commands.shared_options import (
+    AsJson,
+    Skip,
+    given_options,
+    print_document,
+    reads_files,
+    require_word,
+    tell,
+)
 from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.errors import InputError
+from consistency.referee.readers.options import Reading
 
 if TYPE_CHECKING:
     from consistency.referee.readers.formats.innovation_files import NisLog
 
 
+@reads_files(only=("columns", "dof"))
 def monitor_command(
     path: Annotated[
         str,
@@ -26,6 +36,7 @@ def monitor_command(
             "or - for CSV lines.",
         ),
     ],
+    files: Reading,
     innovations: Annotated[
         str | None,
         typer.Option("--innovations", help="'optimal': declare the optimal gain, without which nothing is judged."),
@@ -49,6 +60,7 @@ def monitor_command(
         int | None,
         typer.Option("--run", help="Run to use if FILE holds several; for flight logs, the instance of the EKF."),
     ] = None,
+    skip: Skip = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Plot of NIS and evidence, .png, .pdf or .svg.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing plot.")] = False,
     as_json: AsJson = False,
@@ -58,11 +70,13 @@ def monitor_command(
     from consistency.referee.document.alarms import monitor_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash
-    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines
+    from consistency.referee.verdicts.judge_sources import skip_asked
+    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines, without_first
 
     require_word("--fail-on", fail_on, "alarm")
+    first = skip_asked(skip)
     if is_dataflash(Path(path)) and filter_name not in STATED:
-        if refused := given_options(fail_on=fail_on, gate=gate, mission=mission):
+        if refused := given_options(fail_on=fail_on, gate=gate, mission=mission, skip=skip):
             option = next(iter(refused)).replace("_", "-")
             raise InputError(f"--{option}: {path} holds test ratios, of which nothing is judged, unless --filter names "
                              f"{' or '.join(STATED)}")  # fmt: skip
@@ -70,12 +84,12 @@ def monitor_command(
         return
     watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
     if path == "-":
-        options = given_options(filter=filter_name, run=run, plot=plot)
+        options = given_options(filter=filter_name, run=run, skip=skip, plot=plot)
         if options:
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
-        watched = watch_lines(sys.stdin, "stdin", watcher, lambda alarm: print(alarm, file=sys.stderr, flush=True))
+        watched = watch_lines(sys.stdin, "stdin", watcher, partial(print, file=sys.stderr, flush=True), files)
     else:
-        log = _read_innovations(Path(path), filter_name, run)
+        log = without_first(_read_innovations(Path(path), filter_name, run, files), first)
         tell(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)
@@ -91,15 +105,17 @@ def monitor_command(
         raise typer.Exit(1)
 
 
-def _read_innovations(path: Path, filter_name: str | None, run: int | None) -> NisLog:
+def _read_innovations(path: Path, filter_name: str | None, run: int | None, files: Reading) -> NisLog:
     """Return the innovations of one run in a file, or in a folder of results."""
     if path.is_dir():
         from consistency.bench.runs.results_to_records import innovations_of
+        from consistency.referee.readers.formats.innovation_files import refuse_options
 
+        refuse_options(path, files)
         return innovations_of(path, filter_name, run)
     from consistency.referee.verdicts.monitor_sources import read_innovations
 
-    return read_innovations(path, filter_name, run)
+    return read_innovations(path, filter_name, run, files)
 
 
 def _show_ratios(

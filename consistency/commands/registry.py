@@ -103,7 +103,7 @@ PANELS = {  # of the options of commands that read files; an option that stands 
     ),
     "What to read": (
         "covariance_order", "axes", "topic", "truth_topic", "body", "truth_covariance", "truth_errors", "truth_shared",
-        "filters", "split", "motions",
+        "filters", "split", "motions", "dof",
     ),
     "How to align": ("max_dt", "time_offset", "lever_arm", "windows"),
     "What to ask": ("detect", "tolerance", "lost", "innovations", "confidence", "by"),

@@ -26,11 +26,14 @@ SPATIAL = {
     "so3-body": "position difference in the world frame, rotation vector of R_estimate' R_truth about the body's axes",
     "left": "Log(estimate^-1 truth) of SE(3), in the frame of the estimated body",
     "right": "Log(truth estimate^-1) of SE(3), in the world frame",
+    "rvec": "position difference in the world frame, difference of two rotation vectors, the nearer way round",
+    "euler": "position difference in the world frame, difference of roll, pitch, yaw, R = Rz(yaw) Ry(pitch) Rx(roll)",
 }
 INERTIAL = {
     **SPATIAL,
     "additive": "difference of every number, of the rotation that of two rotation vectors, the nearer way round",
 }  # of poses with a velocity, and biases
+CHARTS = ("rvec", "euler", "additive")  # rotations by differences of coordinates, which depend on the world's axes
 SERIES = 1e-2  # rad, below which the half-angle cotangent is a series; the next term is below 1e-17 there
 
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.geometry.conventions import half_cotangent, se2_log
+from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import CHARTS, half_cotangent, se2_log
 from consistency.referee.types import Array
+
+SMALL = 1e-6  # rad^2, below which a coefficient is that of no turn; the next term is below 1e-8 there
 
 
 def matrices(pose: Array) -> Array:
@@ -89,6 +92,41 @@ def to_left(T: Array, convention: str) -> Array:
         out[..., :d, :d] = back
     if convention == "so3":
         out[..., d:, d:] = back
+    elif convention == "euler":
+        out[..., d:, d:] = _turn_by_angles(T[..., :d, :d])
+    elif convention in CHARTS:
+        out[..., d:, d:] = _turn_by_vector(T[..., :d, :d])
+    return out
+
+
+def from_left(T: Array, convention: str) -> Array:
+    """J (N, n, n) with e = J e_left to first order, the inverse of :func:`to_left`."""
+    if convention in CHARTS:
+        return np.asarray(np.linalg.pinv(to_left(T, convention)))
+    return to_left(inverse(T), convention)
+
+
+def _turn_by_vector(R: Array) -> Array:
+    """Turn about the body's axes with a small change of the rotation vector of R (..., 3, 3): its right Jacobian.
+
+    Source: Solà et al. (2018), eq. 143.
+    """
+    vector = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3) if R.size else R[..., 0]
+    squared = np.square(vector).sum(axis=-1)[..., None, None]
+    angle = np.sqrt(squared)
+    across = np.cross(np.eye(3), vector[..., None, :])
+    once = 0.5 * np.square(np.sinc(0.5 * angle / np.pi))
+    twice = np.where(squared > SMALL, (1.0 - np.sinc(angle / np.pi)) / np.maximum(squared, SMALL), 1.0 / 6.0)
+    return np.asarray(np.eye(3) - once * across + twice * across @ across)
+
+
+def _turn_by_angles(R: Array) -> Array:
+    """Turn about the body's axes with a small change of roll, pitch and yaw of R (..., 3, 3)."""
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    out = np.zeros_like(R)
+    out[..., 0, 0] = 1.0
+    out[..., 1, 1], out[..., 2, 1] = np.cos(roll), -np.sin(roll)
+    out[..., 2] = R[..., 2, :]
     return out
 
 
@@ -105,6 +143,7 @@ def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:
     :func:`consistency.referee.geometry.conventions.planar_error`. ``so3`` is the error of ROS messages
     (geometry_msgs/PoseWithCovariance: position, then rotations about fixed axes); ``so3-body`` is the local angular
     error of Solà (2017), "Quaternion kinematics for the error-state Kalman filter", beside the plain position.
+    ``rvec`` and ``euler`` are differences of rotation vectors, and of roll, pitch, yaw.
     """
     truth, estimate = np.asarray(truth, float), np.asarray(estimate, float)
     shape = np.broadcast_shapes(truth.shape, estimate.shape)
@@ -122,7 +161,12 @@ def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:
     if convention in ("left", "right"):
         error = _twist(shift, delta)
     else:
-        error = np.concatenate([shift, delta.as_rotvec()], axis=-1)
+        turned = delta.as_rotvec()
+        if convention == "euler":
+            turned = _angle_gap(true_turn, turn)
+        elif convention in CHARTS:
+            turned = _vector_gap(true_turn, turn)
+        error = np.concatenate([shift, turned], axis=-1)
     return error.reshape(*shape[:-1], 6)
 
 
@@ -136,9 +180,7 @@ def state_error(truth: Array, estimate: Array, convention: str) -> Array:
     extended poses this is.
     """
     truth, estimate = np.asarray(truth, float), np.asarray(estimate, float)
-    pose = spatial_error(truth[..., :7], estimate[..., :7], "so3" if convention == "additive" else convention)
-    if convention == "additive":
-        pose[..., 3:] = _vector_gap(truth[..., 3:7], estimate[..., 3:7])
+    pose = spatial_error(truth[..., :7], estimate[..., :7], convention)
     rest = truth[..., 7:] - estimate[..., 7:]
     if convention in ("left", "right") and rest.shape[-1]:
         true, own = (np.concatenate([state[..., 7:10], state[..., 3:7]], axis=-1) for state in (truth, estimate))
@@ -146,16 +188,22 @@ def state_error(truth: Array, estimate: Array, convention: str) -> Array:
     return np.concatenate([pose, rest], axis=-1)
 
 
-def _vector_gap(truth: Array, estimate: Array) -> Array:
-    """Difference of the rotation vectors of quaternions (..., 4), the true one of those that differ by whole turns."""
-    shape = truth.shape
-    if not truth.size:
-        return np.empty((*shape[:-1], 3))
-    own, true = (Rotation.from_quat(each.reshape(-1, 4)).as_rotvec() for each in (estimate, truth))
+def _vector_gap(truth: Rotation, estimate: Rotation) -> Array:
+    """Difference of N rotation vectors, (N, 3), the true one of those that differ by whole turns."""
+    own, true = estimate.as_rotvec(), truth.as_rotvec()
     angle = np.linalg.norm(true, axis=1, keepdims=True)
     axis = true / np.where(angle > 0.0, angle, 1.0)
     turns = np.rint(((own * axis).sum(axis=1, keepdims=True) - angle) / (2.0 * np.pi))
-    return np.asarray(true + 2.0 * np.pi * turns * axis - own).reshape(*shape[:-1], 3)
+    return np.asarray(true + 2.0 * np.pi * turns * axis - own)
+
+
+def _angle_gap(truth: Rotation, estimate: Rotation) -> Array:
+    """Difference of N triples roll, pitch, yaw, (N, 3), the true one of the two that mean the same rotation."""
+    own, true = estimate.as_euler("ZYX")[:, ::-1], truth.as_euler("ZYX")[:, ::-1]
+    near = wrap(true - own)
+    other = wrap(np.pi + true * [1.0, -1.0, 1.0] - own)
+    nearer = np.square(other).sum(axis=1) < np.square(near).sum(axis=1)
+    return np.where(nearer[:, None], other, near)
 
 
 def se3_log(pose: Array) -> Array:

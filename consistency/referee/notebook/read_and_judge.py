@@ -53,6 +53,7 @@ def read(
     body_axes: str | None = None,
     truth_world: str | None = None,
     truth_body_axes: str | None = None,
+    dof: int | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -63,8 +64,8 @@ def read(
         memory, as a DataFrame, with the columns of a .csv
     truth : of the same kind, or the folder of a KITTI drive; not with .npz
     covariance : of a TUM trajectory: t and 36 or 21 numbers
-    error : error that the covariance describes: so2, vector, left, right, so3 or so3-body; None is the default,
-        and "guess" judges all that poses have
+    error : error that the covariance describes: so2, vector, left, right, so3, so3-body, rvec or euler; None is
+        the default, and "guess" judges all that poses have
     state : names of the columns that make up the state, in .csv and .parquet; None is x, y, heading
     covariance_order : translation-rotation or rotation-translation, or blocks in their order, as p,v,R; of a trajectory
     max_dt : s, between an estimate and its truth; None is 0.01
@@ -91,6 +92,7 @@ def read(
     columns, truth_columns : names of columns here and in the file: ``{"x": "pos_n", "P*": "cov_*"}``
     world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
         A pose maps from its body axes to its world axes
+    dof : degrees of freedom of each NIS of a table that has no column of them
     filter : which estimator, where the files hold several
 
     Raises
@@ -109,7 +111,7 @@ def read(
         truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
-        world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes,
+        world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates

@@ -12,13 +12,14 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.document.colours import TRUTH, Look, style
+from consistency.referee.geometry.conventions import CHARTS
 from consistency.referee.show.matplotlib_style import dots, make_map, path
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-IN_WORLD = ("so2", "so3", "so3-body", "vector")  # errors whose position is about the axes of the world
+IN_WORLD = ("so2", "so3", "so3-body", "vector", *CHARTS)  # errors whose position is about the axes of the world
 NAMES = "xyz"
 MOST = 5  # ellipses
 SHARE = 0.95  # of a right estimator's errors in a step that lie inside its ellipse

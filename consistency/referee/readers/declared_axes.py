@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
+from consistency.referee.geometry.conventions import CHARTS
 from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.truth_matching import Estimator, Poses
 from consistency.referee.types import Array
@@ -135,8 +136,8 @@ def _carried(P: Array, convention: str, change: Change, in_space: bool) -> Array
         position = C
     if convention in ("left", "so3-body"):
         rotation = C
-    if convention == "additive":
-        raise InputError("--truth-covariance: goes with no other axes of the truth where the error is 'additive'")
+    if convention in CHARTS:
+        raise InputError(f"--truth-covariance: goes with no other axes of the truth where the error is '{convention}'")
     T = np.zeros((6, 6))
     T[:3, :3] = position
     T[3:, 3:] = rotation

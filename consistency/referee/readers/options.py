@@ -75,7 +75,8 @@ class Reading:
     truth: Path | None = _option("Truth of the estimates, in the same form, or the folder of a KITTI drive.")
     covariance: Path | None = _option("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     error: str | None = _option(
-        "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, additive, or guess."
+        "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
+        "guess."
     )
     state: Sequence[str] | None = _option("Columns of the state [x,y,heading].", "A,B,C", _names)
     covariance_order: str | None = _option(
@@ -134,6 +135,7 @@ class Reading:
     body_axes: str | None = _option("Axes of the body of the estimates: flu [default], frd ...", "AXES")
     truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
+    dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

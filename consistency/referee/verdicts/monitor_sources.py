@@ -11,11 +11,21 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.monitoring.monitor import Alarm, Monitor
+from consistency.referee.diagnostics.records.skipped_start import Skip
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
-from consistency.referee.readers.formats.innovation_files import NisLog, choose, read_nis, stream_nis
+from consistency.referee.readers.formats.innovation_files import (
+    DEFAULT,
+    NisLog,
+    choose,
+    read_nis,
+    refuse_options,
+    stream_nis,
+)
 from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog
+from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
+from consistency.referee.verdicts.judge_sources import refused
 
 OPTIMAL = "optimal"
 
@@ -58,21 +68,46 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
         raise InputError(f"--{name.replace('_', '-')} {rest}") from None
 
 
-def read_innovations(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
+def read_innovations(
+    path: Path, filter_name: str | None = None, run: int | None = None, r: Reading = DEFAULT
+) -> NisLog:
     """Read the innovations of one run from a file.
 
-    Of a flight log (.ulg of PX4, .bin of ArduPilot), ``filter_name`` is the sensor, and ``run`` the EKF's instance.
+    Of a flight log (.ulg of PX4, .bin of ArduPilot), ``filter_name`` is the sensor, and ``run`` the EKF's instance;
+    ``r`` is of tables.
 
     Raises
     ------
     InputError
         Something cannot be used, or there are several filters or runs and none is named.
     """
+    if path.suffix.lower() == SUFFIX or is_dataflash(path):
+        refuse_options(path, r)
     if path.suffix.lower() == SUFFIX:
         return read_ulog(path, filter_name, run)
     if is_dataflash(path):
         return read_stated(path, choose(path, "filter", list(STATED), filter_name), run)
-    return read_nis(path, filter_name, run)
+    return read_nis(path, filter_name, run, r)
+
+
+def without_first(log: NisLog, skip: Skip | None) -> NisLog:
+    """The innovations after the first steps or seconds, which keep their numbers.
+
+    Raises
+    ------
+    InputError
+        Nothing is left, or seconds are asked for and there are no times.
+    """
+    if skip is None:
+        return log
+    try:
+        kept = ~skip.mask((1, len(log.nis)), log.t[None])[0]
+    except ValueError as error:
+        raise refused(error) from None
+    if not kept.any():
+        raise InputError(f"--skip {skip.option}: nothing of {log.name} is left, which has {len(kept)} steps")
+    arrays = {name: getattr(log, name)[kept] for name in ("step", "t", "nis", "dof")}
+    return replace(log, **arrays, notes=(*log.notes, f"{log.name}: {skip.text} are left out (--skip)"))
 
 
 def watch(log: NisLog, monitor: Monitor) -> Watched:
@@ -95,7 +130,9 @@ def watch(log: NisLog, monitor: Monitor) -> Watched:
     return Watched(log.name, monitor, alarm, *times, log.step, log.t, ratio, evidence)
 
 
-def watch_lines(lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Callable[[Alarm], None]) -> Watched:
+def watch_lines(
+    lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Callable[[Alarm], None], r: Reading = DEFAULT
+) -> Watched:
     """Put lines of a CSV file through a new monitor as they come; step k is the k-th row.
 
     ``on_alarm`` is called in the row in which the alarm is raised.
@@ -106,7 +143,7 @@ def watch_lines(lines: Iterable[str], name: str, monitor: Monitor, on_alarm: Cal
         A line that cannot be used.
     """
     try:
-        for place, nis, dof in stream_nis(lines, name):
+        for place, nis, dof in stream_nis(lines, name, r):
             try:
                 alarm = monitor.update(nis, dof)  # type: ignore[arg-type]  # refuses what is not whole
             except ValueError as error:

@@ -48,6 +48,10 @@ def applied(p, R, e, convention):
         return p + e[:3], R * turn
     if convention == "left":
         return p + R.apply(e[:3]), R * turn
+    if convention == "rvec":
+        return p + e[:3], Rotation.from_rotvec(R.as_rotvec() + e[3:])
+    if convention == "euler":
+        return p + e[:3], Rotation.from_euler("ZYX", R.as_euler("ZYX") + e[:2:-1])
     return turn.apply(p) + e[:3], turn * R
 
 
@@ -86,7 +90,7 @@ def test_the_right_convention_is_the_one_that_is_left(guesses, convention):
 
 
 def test_the_declared_error_has_its_own_status_and_intervals_hold_together(files, guesses):
-    """Bonferroni over four conventions: wider than the interval of one."""
+    """Bonferroni over all conventions: wider than the interval of one."""
     right, wrong, guess = read(files["left"], "left"), read(files["left"], "so3"), guesses["left"]
     assert judge(wrong).status not in ("consistent", "undecided")
     v = judge(guess)
@@ -106,8 +110,8 @@ def test_none_fits(tmp_path):
     (guess,) = read_recordings(*write(tmp_path, "left", factor=9.0), error="guess")
     v = judge(guess)
     assert v.status == "undecided"
-    assert "at a rate of 5 % each all are rejected: so3, so3-body, left, right" in v.reasons[0]
-    assert len([line for line in v.reasons if line.startswith("if the error is ")]) == 4
+    assert "at a rate of 5 % each all are rejected: so3, so3-body, left, right, rvec, euler" in v.reasons[0]
+    assert len([line for line in v.reasons if line.startswith("if the error is ")]) == len(SPATIAL)
 
 
 def test_the_command(files, capsys):

@@ -268,9 +268,9 @@ WRONG = {
         r"file: the name 'est\x1b[2J.csv' has a control character",
     ),
     "dates": (
-        lambda at: poses()[0].assign(t=pd.Timestamp("2024-01-01 00:00:07")).to_parquet(at / "est.parquet"),
+        lambda at: poses()[0].assign(x=pd.Timestamp("2024-01-01 00:00:07")).to_parquet(at / "est.parquet"),
         ("est.parquet", "--truth", "est.parquet"),
-        "est.parquet, row 0: column 't': a truth value or a date, which is to be written as a number (2024-01-01",
+        "est.parquet, row 0: column 'x': a truth value or a date, which is to be written as a number (2024-01-01",
     ),
     "npz symmetry": (
         npz(errors=ERRORS, covariances=np.tile(ASYMMETRIC, (2, 3, 1, 1))),

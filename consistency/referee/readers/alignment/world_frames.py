@@ -12,7 +12,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.geometry import wrap
-from consistency.referee.geometry.lie_groups import adjoint, inverse, matrices, propagated, to_left, vectors
+from consistency.referee.geometry.conventions import CHARTS
+from consistency.referee.geometry.lie_groups import (
+    adjoint,
+    from_left,
+    inverse,
+    matrices,
+    propagated,
+    to_left,
+    vectors,
+)
 from consistency.referee.readers.truth_matching import Manifold, Poses, finite_rows
 from consistency.referee.types import Array
 
@@ -61,8 +70,15 @@ IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 
 def moved(p: Poses, frame: WorldTransform) -> Poses:
     """The estimates in another world, with their covariance."""
-    T = carried(p.convention, frame, p.covariance.shape[-1])
     estimate = frame.placed(p.estimate, p.manifold)
+    if p.convention in CHARTS:
+        finite = finite_rows(p.estimate)
+        before, after = (matrices(poses[finite]) for poses in (p.estimate, estimate))
+        J = from_left(after, p.convention) @ to_left(before, p.convention)
+        covariance = p.covariance.copy()
+        covariance[finite] = propagated(J, p.covariance[finite])
+        return replace(p, estimate=estimate, covariance=covariance)
+    T = carried(p.convention, frame, p.covariance.shape[-1])
     return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
 
 
@@ -72,7 +88,7 @@ def carried(convention: str, frame: WorldTransform, n: int) -> Array:
     An error in the body frame is unchanged; that of ``right`` maps by the adjoint (Sola et al. 2018, eq. 159 and 175).
     """
     F = matrices(np.array([[*frame.shift, *frame.turn.as_quat()]]))
-    T: Array = to_left(inverse(F), convention)[0]
+    T: Array = from_left(F, convention)[0]
     if n == 6:
         return T
     return T[np.ix_(PLANE[:n], PLANE[:n])]
@@ -178,7 +194,7 @@ def on_body(p: Poses, body: BodyTransform) -> Poses:
     B = matrices(np.array([pose]))
     T = matrices(p.estimate[finite])
     other = T @ B
-    J = to_left(inverse(other), p.convention) @ adjoint(inverse(B)) @ to_left(T, p.convention)
+    J = from_left(other, p.convention) @ adjoint(inverse(B)) @ to_left(T, p.convention)
     estimate = p.estimate.copy()
     covariance = p.covariance.copy()
     estimate[finite] = vectors(other)

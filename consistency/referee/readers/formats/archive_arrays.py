@@ -18,6 +18,10 @@ from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
 
+FEWEST = 10  # runs and steps from which on swapped arrays are looked for
+ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
+ALIKE = 0.5  # correlation from run to run
+UNLIKE = 0.2  # of it, from step to step
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
 
 
@@ -187,6 +191,59 @@ def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
     if found != (needed[1], needed[0], *needed[2:]):
         return ""
     return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"
+
+
+def require_layout(key: str, e: tuple[int, ...], P: tuple[int, ...], where: str = "") -> None:
+    """Refuse errors or estimates of shape ``e`` beside covariances of shape ``P`` in the layout of another program.
+
+    Raises
+    ------
+    InputError
+        Components come first, a state is a column, or matrices are variances, rows of numbers, or one for all.
+    """
+    if len(e) < 2 or (*e, e[-1]) == P:
+        return
+    n = e[-1]
+    full = (*e, n)
+    remedy = ""
+    if (e[0], *e) == P and len(P) > 2:
+        remedy = f"components come first: np.moveaxis({key}, 0, -1) and np.moveaxis(covariances, (0, 1), (-2, -1)) " \
+                 "put them behind runs and steps"  # fmt: skip
+    elif n == 1 and (*e[:-1], e[-2]) == P:
+        remedy = f"a state is a column, (n, 1): take {key}[..., 0]"
+    elif n > 1 and (*e[:-1], n * n) == P:
+        remedy = f"each matrix is a row of {n * n} numbers: covariances.reshape({full})"
+    elif e == P:
+        remedy = f"variances are covariances[..., None] * np.eye({n})"
+        remedy += "" if where else ", standard deviations go into deviations="
+    elif len(e) == 3 and e[0] > 1 and P in (full[1:], full[2:]):
+        remedy = f"one for all is np.broadcast_to(covariances, {full})"
+    if remedy:
+        raise InputError(f"{where}{key} has shape {e} and covariances {P}; needed are (runs, steps, n) and "
+                         f"(runs, steps, n, n); {remedy}")  # fmt: skip
+
+
+def swapped(name: str, errors: Array) -> list[str]:
+    """A hint where errors (runs, steps, n) correlate from run to run, and not from step to step; none elsewhere."""
+    runs, steps, _ = errors.shape
+    if runs < FEWEST or steps < FEWEST or runs * steps < ENOUGH:
+        return []
+    e = np.where(np.isfinite(errors), errors, 0.0)
+    of_runs, of_steps = (_lag(e - e.mean(axis=axis, keepdims=True), axis) for axis in (0, 1))
+    if of_runs < ALIKE or abs(of_steps) > UNLIKE * of_runs:
+        return []
+    return [
+        f"{name}: errors correlate by {of_runs:.2f} from one run to the next and by {of_steps:.2f} from one step to "
+        "the next, as in arrays (steps, runs, n); the order is (runs, steps, n): np.swapaxes(array, 0, 1) of each"
+    ]
+
+
+def _lag(e: Array, axis: int) -> float:
+    """Mean correlation of errors (runs, steps, n) with their neighbours along an axis, over components."""
+    e = np.moveaxis(e, axis, 0)
+    size = np.square(e).mean(axis=(0, 1))
+    together = (e[1:] * e[:-1]).mean(axis=(0, 1))
+    return float(np.mean(together / np.where(size > 0, size, 1.0)))
 
 
 # --- files of MATLAB ---------------------------------------------------------------------------------

@@ -114,9 +114,9 @@ def _stated(
     n = len(axes)
     exact = {name: place for place, name in enumerate(names)}
     once = places_of(names)
-    own = _entries(exact, axes, "P_{}_{}")
+    own = entries_of(exact, axes, "P_{}_{}")
     if is_pose(axes):
-        own = _entries(exact, "xyh", "P_{}{}") | own
+        own = entries_of(exact, "xyh", "P_{}{}") | own
     if _diagonal(n) <= set(own):
         yield Entries(own)
     if not own and (deviations := alike(exact, axes, known.DEVIATIONS)):
@@ -127,7 +127,7 @@ def _stated(
         for spelling in spellings:
             if not variances and spelling.format(labels[0], labels[0]) not in once:
                 continue
-            found = {**variances, **_entries(once, labels, spelling)}
+            found = {**variances, **entries_of(once, labels, spelling)}
             if _diagonal(n) <= set(found) and len(found) > len(best):
                 best = found
     if len(best) > n:
@@ -156,7 +156,7 @@ def _by_pairs(places: Sequence[int]) -> dict[tuple[int, int], int]:
     return {(i, i): place for i, place in enumerate(places)}
 
 
-def _entries(places: Mapping[str, int], words: Sequence[str], spelling: str) -> dict[tuple[int, int], int]:
+def entries_of(places: Mapping[str, int], words: Sequence[str], spelling: str) -> dict[tuple[int, int], int]:
     """Places of the entries of a covariance by row and column.
 
     None where two entries have one name, as P111 of eleven components, which may be P(1,11) or P(11,1).
@@ -295,8 +295,8 @@ def _pose_covariance(names: Sequence[str], rest: int) -> tuple[tuple[int, ...], 
         if variances:
             return variances, True
     once = places_of(names)
-    rotation = Entries(_entries(once, "rpy", "q{}{}")).in_order(3)
-    position = Entries(_entries(once, "xyz", "p{}{}")).in_order(3)
+    rotation = Entries(entries_of(once, "rpy", "q{}{}")).in_order(3)
+    position = Entries(entries_of(once, "xyz", "p{}{}")).in_order(3)
     return (rotation + position if rotation and position else ()), False
 
 

@@ -13,13 +13,18 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
 from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
+from consistency.referee.readers.formats.innovation_columns import with_nis
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, CsvTable, TableRows, checked_dof, read_sheet
+from consistency.referee.readers.formats.spellings import renamed
 from consistency.referee.readers.formats.table_columns import row_order, with_clock
 from consistency.referee.readers.formats.text_blocks import bounded
+from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
+DEFAULT = Reading()
 NEEDED = ("nis", "nis_dof")
+WAYS = "needed are nis and nis_dof, or innovation and innovation_variance"
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,13 @@ def numbered_log(name: str, t: Array, nis: Array, dof: Array, notes: Iterable[st
     return NisLog(name, np.arange(1.0, len(nis) + 1), t, nis, dof, tuple(notes))
 
 
-def read_nis(path: Path, filter_name: str | None = None, run: int | None = None) -> NisLog:
+def read_nis(path: Path, filter_name: str | None = None, run: int | None = None, r: Reading = DEFAULT) -> NisLog:
     """Columns ``nis`` and ``nis_dof`` of a .csv, .parquet or .npz file; ``step``, ``t``, ``run``, ``filter`` if there.
 
     Parameters
     ----------
     filter_name, run : which one, where the file holds several; the runs of an archive are its rows, from 0
+    r : of a table, ``columns`` in place of its own, and ``dof`` of each NIS where no column states them
 
     Raises
     ------
@@ -60,8 +66,15 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None)
     if suffix in ARCHIVES:
         if filter_name is not None:
             raise InputError(f"--filter {filter_name}: does not go with {path}")
+        refuse_options(path, r)
         return _of_archive(path, run)
-    return _of_table(path, filter_name, run)
+    return _of_table(path, filter_name, run, r)
+
+
+def refuse_options(path: Path, r: Reading) -> None:
+    """Refuse the options of tables."""
+    for option in r.given(("columns", "dof")):
+        raise InputError(f"--{option}: goes with tables, not with {path}")
 
 
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
@@ -84,12 +97,12 @@ def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "
 def _require_columns(place: Path | str, columns: Sequence[str]) -> None:
     for needed in NEEDED:
         if needed not in columns:
-            there = ", ".join(columns[:12])
-            raise InputError(f"{place}: '{needed}' is missing; needed are nis and nis_dof, there are: {there}")
+            raise InputError(f"{place}: '{needed}' is missing; {WAYS}, there are: {listed(columns, 12)}; --columns "
+                             f"{needed}=NAME says what it is called")  # fmt: skip
 
 
-def _of_table(path: Path, filter_name: str | None, run: int | None) -> NisLog:
-    sheet = read_sheet(path)
+def _of_table(path: Path, filter_name: str | None, run: int | None, r: Reading) -> NisLog:
+    sheet, note = with_nis(read_sheet(path, r.columns), r.dof)
     _require_columns(path, list(sheet.data))
     sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
     for key in ("step", "t"):
@@ -108,7 +121,7 @@ def _of_table(path: Path, filter_name: str | None, run: int | None) -> NisLog:
         step = sheet.numbers("step")
     if "t" in sheet:
         t = sheet.numbers("t")
-    return NisLog(name, step, t, nis, dof, tuple(filter(None, [sheet.cut])))
+    return NisLog(name, step, t, nis, dof, tuple(filter(None, [sheet.cut, note])))
 
 
 def _of_one(sheet: TableRows, column: str, choice: str | int | None) -> TableRows:
@@ -164,7 +177,7 @@ def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
     return arrays | {"nis": nis, "nis_dof": dof}
 
 
-def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, float]]:
+def stream_nis(lines: Iterable[str], name: str, r: Reading = DEFAULT) -> Iterator[tuple[str, float, float]]:
     """Place, NIS and degrees of freedom from the lines of a CSV file of one run, each as it comes.
 
     Raises
@@ -179,9 +192,12 @@ def stream_nis(lines: Iterable[str], name: str) -> Iterator[tuple[str, float, fl
             continue
         fields = table.row(number, text)
         if fields is None:
-            _require_one_run(name, table.names)
+            table.names = renamed(table.names, r.columns, table.path)
+            empty = TableRows(table.path, dict.fromkeys(table.names, np.empty(0)), np.empty(0, int), "line")
+            _require_one_run(name, list(with_nis(empty, r.dof)[0].data))
             continue
         row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
+        row, _ = with_nis(row, r.dof)
         nis = float(row.numbers("nis")[0])
         dof = float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import PLANAR
-from consistency.referee.readers.formats.archive_arrays import KINDS, Archive, load_arrays
+from consistency.referee.readers.formats.archive_arrays import KINDS, Archive, load_arrays, require_layout, swapped
 from consistency.referee.readers.formats.sheet import are_dof
 from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import Reading
@@ -76,6 +76,8 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         assert found.nees is not None
         return replace(found, by=archive.groups(r, found.nees.shape))
     declared = ""
+    if kind != OF_NEES:
+        require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
     if kind == OF_ERRORS:
         truth = archive.array("errors", 3)
         estimates = np.where(np.isfinite(truth), 0.0, np.nan)
@@ -113,13 +115,13 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         own |= {"covariance": P, "stated": stated, "true_covariance": T, "manifold": manifold, "convention": convention}
         poses.append(replace(one, **own))
     axes = archive.axes(n)
-    causes = []
+    gap = np.where(there[..., None], truth - estimates, np.nan)
+    causes = swapped(path.stem, gap)
     if convention == "vector":
         remedy = "wrap it to [-pi, pi]"
         if declared and n == 3:
             remedy = "add --error so2, if these are x, y, heading"
-        gap = np.where(there[..., None], truth - estimates, np.nan)
-        causes = turns(path.stem, axes, gap, covariances, remedy)
+        causes += turns(path.stem, axes, gap, covariances, remedy)
     if r.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
     definition = PLANAR.get(declared, "")

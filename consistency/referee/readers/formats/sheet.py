@@ -9,6 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, keys_once, one_line, reading, require_name
 from consistency.referee.readers.formats.file_head import Head
-from consistency.referee.readers.formats.spellings import Columns, renamed
+from consistency.referee.readers.formats.spellings import Columns, clock_of, renamed
 from consistency.referee.readers.formats.text_blocks import (
     Block,
     FileRows,
@@ -40,6 +41,7 @@ EMPTY = frozenset((  # what pandas and R write for no value
 OF_ONE_RUN = "write such poses to a file for each run and estimator"  # of a file with these columns
 NIS_DOF = "it is the number of measurements in each nis"  # of a column that is missing
 DOF_NEEDED = "a whole number from 0 to below 2^31"
+DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d)(?::(\d\d(?:[.,]\d+)?))?\s?(Z|UTC|[+-]\d\d:?\d\d)?")
 TRUTHS = {"True": True, "true": True, "TRUE": True, "False": False, "false": False, "FALSE": False}
 
 
@@ -72,6 +74,9 @@ class TableRows(FileRows):
             values = np.array(list(map(_number, cells)), float)
         values = bounded(values)
         unread = np.isnan(values) & ~self.empty(column)
+        if unread.any() and clock_of([column]) is not None:
+            values[unread] = list(map(seconds_of_date, cells[unread]))
+            unread = np.isnan(values) & ~self.empty(column)
         self._refuse(unread, column, _no_number(cells[unread]))
         if finite or whole:
             self._refuse(~np.isfinite(values), column, "not a finite number")
@@ -314,6 +319,20 @@ def _number(cell: object) -> float:
             return math.nan
     if isinstance(cell, int | float | np.number) and not isinstance(cell, bool):
         return float(cell)
+    return math.nan
+
+
+def seconds_of_date(cell: object) -> float:
+    """Seconds since 1970 of a date with a time of ISO 8601, which is in UTC unless it says otherwise; NaN of others."""
+    found = DATE.fullmatch(str(cell).strip())
+    if found is None:
+        return math.nan
+    day, minute, second, zone = found.groups()
+    with suppress(ValueError):
+        at = np.datetime64(f"{day}T{minute}", "s").astype(np.int64) + float((second or "0").replace(",", "."))
+        if zone and zone[0] in "+-":
+            at -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
+        return float(at)
     return math.nan
 
 

@@ -17,6 +17,7 @@ from consistency.referee.readers.formats import table_columns as columns
 from consistency.referee.readers.formats.columns import covariance_columns, is_pose
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
+from consistency.referee.readers.formats.innovation_columns import with_nis
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
@@ -48,8 +49,10 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
     """
     if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
         raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    axes = tuple(r.state or POSE)
+    axes = tuple(r.state or _own_state(estimates, r) or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
+    if r.state is None and axes != tuple(POSE):
+        notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its covariance P_* says; --state names another")
     convention = _convention(r.error, axes, truth)
     _require_truth(sheet, truth, axes, convention, r)
     key = _key(sheet, truth, r)
@@ -78,6 +81,9 @@ def _both(
     if r.truth is not None:
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
+    sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
+    sheet, of_nis = with_nis(sheet, r.dof, required=truth is None and columns.true_columns(sheet, axes) is None)
+    notes += by_name, of_nis
     by_step = "step" in sheet and (truth is None or "step" in truth)
     if not by_step or r.time_offset is not None or r.max_dt is not None:
         sheet = columns.with_clock(sheet)
@@ -91,6 +97,14 @@ def _both(
         elif missing:
             notes.append(f"{sheet.path}: only the NIS is read, because the truth cannot be used: {missing}")
     return sheet, truth, [note for note in notes if note]
+
+
+def _own_state(table: Path | TableRows, r: Reading) -> list[str]:
+    """The state of a table of estimates that names it in its covariance; none of poses."""
+    if isinstance(table, TableRows):
+        return columns.stated_state(list(table.renamed(r.columns).data))
+    head = head_of(table, r.columns) if table.suffix.lower() == ".csv" else None
+    return [] if head is None else columns.stated_state(head.names)
 
 
 def _sheet(
@@ -157,7 +171,10 @@ def _require_truth(
     if r.align is not None and convention == "vector":
         raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
     if truth is None and not sheet.has("nis", "nis_dof"):
-        others = f"columns nis and nis_dof to be judged by the NIS alone, or columns true_{axes[0]}, … beside the state"
+        others = (
+            "columns nis and nis_dof, or innovation and innovation_variance, to be judged by the NIS alone, or columns "
+            f"true_{axes[0]}, … beside the state"
+        )
         state = ""
         if not sheet.among(axes):
             state = f"; the columns of another state than {','.join(axes)} are named by --state A,B"
@@ -246,8 +263,12 @@ def _estimator(
         notes += filter(None, [note])
     if r.relative is not None and not r.motions:
         cross = columns.stated_cross_covariances(sheet)
+    own_of_truth = covariance_columns(list(truth.data), axes)
+    if r.truth is not None and r.truth_covariance is None and columns.states_any(truth, own_of_truth, len(axes)):
+        notes.append(f"{truth.path}: the truth states a covariance of its own, which counts as 0; see "
+                     f"--truth-covariance {COLUMNS}")  # fmt: skip
     if r.truth_covariance is not None:
-        of_truth = columns.stated_covariance(truth, axes, covariance_columns(list(truth.data), axes))
+        of_truth = columns.stated_covariance(truth, axes, own_of_truth)
     estimate = sheet.matrix(axes)
     estimate[~finite_rows(estimate)] = np.nan
     nis, dof = columns.nis_columns(sheet)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,19 @@ from consistency.referee.readers.clock_units import unit_of
 from consistency.referee.readers.formats.columns import Entries, covariance_columns, entry_name, is_pose, state_columns
 from consistency.referee.readers.formats.file_head import fields_of
 from consistency.referee.readers.formats.sheet import NIS_DOF, TableRows, checked_dof
-from consistency.referee.readers.formats.spellings import OWN, TRUE, Clock, clock_of, naming, require_units
+from consistency.referee.readers.formats.spellings import (
+    OWN,
+    QUATERNIONS,
+    TRUE,
+    Clock,
+    clock_of,
+    naming,
+    places_of,
+    require_units,
+)
 from consistency.referee.readers.formats.text_blocks import FileRows, blocks
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.places import exact
+from consistency.referee.readers.places import exact, listed
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
 
@@ -88,6 +98,68 @@ def require_columns(sheet: TableRows, axes: Sequence[str]) -> None:
             hint = " (poses in space have x, y, z, qx, qy, qz, qw); name other states with --state a,b,c"
         what = f"column '{axis}' is missing; there are: {sheet.columns}"
         raise InputError(f"{sheet.path}: {what}; {naming(axis)}{hint}")
+
+
+def stated_state(names: Sequence[str]) -> list[str]:
+    """The state that a covariance of columns ``P_a_b`` names, where each a is a column; none of poses."""
+    pairs = [name for name in names if name.startswith("P_")]
+    axes = [found[1] for name in pairs if (found := re.fullmatch(r"P_(.+)_\1", name))]
+    known = {f"P_{a}_{b}" for a, b in itertools.product(axes, repeat=2)}
+    is_whole = set(pairs) <= known and len(state_columns(names, axes, OWN)) == len(axes)
+    has_pose = len(state_columns(names, POSE, OWN)) == len(POSE)
+    turns = any(spelling.format("w") in places_of(names) for spelling in QUATERNIONS)
+    return axes if is_whole and not has_pose and not turns else []
+
+
+def states_any(sheet: TableRows, entries: Entries, n: int) -> bool:
+    """Whether a table states variances or deviations of all n components, of which one is above 0."""
+    names = list(sheet.data)
+    columns = [names[entries.places[i, i]] for i in range(n) if (i, i) in entries.places]
+    return len(columns) == n and bool((sheet.matrix(columns) > 0).any())
+
+
+# --- rows without a number or a time -----------------------------------------------------------------
+
+
+def paired_by_name(
+    sheet: TableRows, truth: TableRows | None, axes: Sequence[str]
+) -> tuple[TableRows, TableRows | None, str]:
+    """Estimates and truth whose rows a text such as the name of an image pairs, each row a run, and a note.
+
+    They stay as they are where one has a step or a time, or no text is there once for each row.
+    """
+    both = [sheet] if truth is None else [sheet, truth]
+    if any("step" in each or clock_of(list(each.data)) is not None for each in both):
+        return sheet, truth, ""
+    if truth is None and true_columns(sheet, axes) is None:
+        if not {"run", "step"} & set(sheet.data):
+            sheet = replace(sheet, data=sheet.data | {"step": np.arange(1.0, len(sheet) + 1)})
+        return sheet, truth, ""
+    for name, cells in sheet.data.items():
+        of_one = sheet.texts("filter").tolist() if "filter" in sheet else [""] * len(sheet)
+        own = list(map(str, cells))
+        if cells.dtype.kind == "f" or name in ("filter", *axes) or len(set(zip(of_one, own, strict=True))) < len(own):
+            continue
+        note = f"{sheet.path}: rows are paired by '{name}', and each is a run of its own"
+        numbers = {text: float(k) for k, text in enumerate(dict.fromkeys(own))}
+        if truth is None:
+            return _numbered(sheet, name, numbers), None, note
+        if name not in truth or len(set(truth.texts(name))) < len(truth):
+            continue
+        there = np.isin(own, truth.texts(name).astype(str))
+        if not there.any():
+            raise InputError(f"{truth.path}: no '{name}' of {sheet.path} is in it, whose first is '{own[0]}'")
+        if not there.all():
+            missing = [text for text, found in zip(own, there, strict=True) if not found]
+            note += f"; {len(missing)} have no truth and are left out ({listed(missing)})"
+        true = truth.rows(np.isin(truth.texts(name).astype(str), own))
+        return _numbered(sheet.rows(there), name, numbers), _numbered(true, name, numbers), note
+    return sheet, truth, ""
+
+
+def _numbered(sheet: TableRows, name: str, numbers: Mapping[str, float]) -> TableRows:
+    runs = np.array([numbers[text] for text in sheet.texts(name)])
+    return replace(sheet, data=sheet.data | {"run": runs, "step": np.ones(len(runs))})
 
 
 # --- times and order ---------------------------------------------------------------------------------
@@ -253,7 +325,7 @@ def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:
     if "nis" not in sheet:
         return None, None
     if "nis_dof" not in sheet:
-        raise InputError(f"{sheet.path}: column 'nis_dof' is missing; {NIS_DOF}")
+        raise InputError(f"{sheet.path}: column 'nis_dof' is missing; {NIS_DOF}; --dof N is one for all rows")
     nis = sheet.numbers("nis")
     dof = np.where(np.isnan(nis), 0.0, sheet.numbers("nis_dof"))
     return nis, checked_dof(nis, dof, sheet.place)

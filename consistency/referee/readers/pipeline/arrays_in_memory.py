@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from consistency.referee.diagnostics.records.record import Record, each_alone
 from consistency.referee.diagnostics.words.numbers import is_or_are
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
+from consistency.referee.readers.formats.archive_arrays import require_layout
 from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.records import records_of
@@ -43,6 +45,8 @@ def record_of_arrays(
     if independent:
         _require_rows({key: array.shape for key, array in arrays.items()})
         arrays = {key: array[:, None] for key, array in arrays.items()}
+    if first == "errors" and "covariances" in arrays:
+        require_layout(first, arrays[first].shape, arrays["covariances"].shape)
     shape = arrays[first].shape
     wanted = ["runs", "steps"]
     if first == "errors":
@@ -73,18 +77,29 @@ def record_of_arrays(
         never = ~(there | mask).any(axis=0)
         if never.any():
             step = int(np.argmax(never)) + 1
+            if sigma is not None and key == "covariances":
+                key = "deviations"
             raise InputError(f"{key}, step {step}: not finite in any run; a run that failed has NaN from there on")
     if mask.any():
         arrays["mask"] = mask
     if axes is not None:
         arrays["axes"] = np.asarray(axes, str)
-    record = estimator_of_arrays(Path("arrays"), arrays, Reading())
-    if isinstance(record, Estimator):
-        (record,) = records_of(record, Reading())
+    try:
+        record = estimator_of_arrays(Path("arrays"), arrays, Reading())
+        if isinstance(record, Estimator):
+            (record,) = records_of(record, Reading())
+    except InputError as error:
+        raise InputError(_in_python(str(error), sigma is not None)) from None
     if sigma is not None:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
+
+
+def _in_python(message: str, deviations: bool) -> str:
+    """A message on an archive as one on arguments: "key 'nees'" is nees."""
+    text = re.sub(r"(?:arrays: )?key '(\w+)'", r"\1", message)
+    return re.sub(r"\bcovariances?\b", "deviations", text) if deviations else text
 
 
 def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:

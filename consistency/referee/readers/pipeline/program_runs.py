@@ -24,6 +24,10 @@ from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
+from consistency.referee.readers.formats.file_head import head_of
+from consistency.referee.readers.formats.file_kinds import TRAJECTORIES
+from consistency.referee.readers.formats.innovation_columns import has_nis
+from consistency.referee.readers.formats.spellings import TRUE, stem_of
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.pipeline.run_folders import NUMBERS, keep_numbers, kept_numbers, merged
@@ -162,7 +166,11 @@ class ProgramStudy:
             if "input" in run.values and is_recorded(path):
                 base = Path(run.values["here"])
             own[name] = base / filled(path, run.known)
-        return run.folder / filled(self.estimates, run.known), replace(r, **own)
+        estimates = run.folder / filled(self.estimates, run.known)
+        beside = run.folder / f"truth{estimates.suffix}"
+        if r.truth is None and r.truth_topic is None and beside.is_file() and _needs_truth(estimates, r):
+            own["truth"] = beside
+        return estimates, replace(r, **own)
 
 
 def study_in(folder: Path) -> ProgramStudy:
@@ -289,7 +297,11 @@ class Runs:
         for path, option in ((estimates, "--estimates"), (r.truth, "--truth"), (r.covariance, "--covariance")):
             if path is not None and not path.exists():
                 raise InputError(_nothing(path, option, run))
-        return merged({run.run: self._found_in(estimates, r)}, self.study.name)
+        found = merged({run.run: self._found_in(estimates, r)}, self.study.name)
+        if r.truth is None or self.options.truth is not None:
+            return found
+        note = f"{r.truth}: taken as the truth of the run, as no column of {estimates.name} is one; see --truth"
+        return [replace(one, notes=(*one.notes, note)) for one in found]
 
     @property
     def first(self) -> int:
@@ -351,6 +363,13 @@ def log_lines(path: Path, lines: int) -> list[str]:
     except OSError:
         return []
     return [line.rstrip() for line in text.splitlines() if line.strip()][-lines:]
+
+
+def _needs_truth(path: Path, r: Reading) -> bool:
+    """Whether no column of a text file of estimates is a truth, an innovation or a NIS."""
+    head = head_of(path, r.columns) if path.suffix.lower() in (".csv", *TRAJECTORIES) else None
+    names = [] if head is None else head.names
+    return not (has_nis(names) or any(stem_of(name, TRUE) for name in names))
 
 
 def _nothing(path: Path, option: str, run: ProgramRun) -> str:

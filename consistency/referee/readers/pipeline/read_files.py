@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import INERTIAL, PLANAR, SPATIAL
+from consistency.referee.geometry.conventions import CHARTS, INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import is_file, read_json, require_name
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
@@ -38,7 +38,7 @@ from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
 ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
-IN_COLUMNS = ("so2", "so3", "so3-body", "vector", "additive")  # differences of columns of positions and velocities
+IN_COLUMNS = ("so2", "so3", "so3-body", "vector", *CHARTS)  # differences of columns of positions and velocities
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
     "truth_covariance": ", whose covariance is of a declared error too",
@@ -131,11 +131,11 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES), _bags),
-    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
+    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state"), _trajectories),
+    Kind(_is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
 )
 
 

@@ -147,6 +147,7 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
         raise InputError(f"{path}: states no covariance: its variances are {values}")
     missing = ",".join(AXES[i] for i in np.flatnonzero(none))
     note = f"{path}: the variances of {missing} are {values}, so not stated and not judged"
+    note += f", as by --axes {','.join(AXES[i] for i in np.flatnonzero(~none))}"
     return np.flatnonzero(~none).tolist(), note if missing else ""
 
 

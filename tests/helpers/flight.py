@@ -41,6 +41,19 @@ class Flight:
         numbers = np.concatenate([part.ravel() for part in each]).astype("<f4").tobytes()
         self.body += message("D", struct.pack("<H", self.ids[key]) + stamps + numbers)
 
+    def other(self, topic, fields, instance=0):
+        """One message of another topic: fields with their types, ("<Q", 7) of eight bytes or ("<B", 1) of one."""
+        types = {"<Q": "uint64_t", "<I": "uint32_t", "<B": "uint8_t", "<f": "float"}
+        key = topic, instance
+        if key not in self.ids:
+            if not any(name == topic for name, _ in self.ids):
+                text = "".join(f"{types[kind]} {name};" for name, (kind, _) in fields.items())
+                self.head += message("F", f"{topic}:{text}".encode())
+            self.ids[key] = len(self.ids)
+            self.body += message("A", struct.pack("<BH", instance, self.ids[key]) + topic.encode())
+        data = b"".join(struct.pack(kind, value) for kind, value in fields.values())
+        self.body += message("D", struct.pack("<H", self.ids[key]) + data)
+
     def both(self, stamp, values, instance=0):
         """Innovations and variances of one step, by field."""
         for k, topic in enumerate(self.topics):

@@ -263,10 +263,13 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
         (["boot_us"], {"t_ms": "boot_us"}, ["t_ms"]),
         (["c_0", "c_1", "c"], {"cov_*": "c_*"}, ["cov_0", "cov_1", "c"]),
         (["Pos N"], {"x": "pos_n"}, ["x"]),
+        (["eph", "x"], {"sigma_x": "eph", "sigma_y": "eph"}, ["sigma_x", "x", "sigma_y"]),
+        (["c_x", "b"], {"P_*": "c_*", "x": "b", "s_*": "c_*"}, ["P_x", "x", "s_x"]),
+        (["e"], {"a": "e", "b": "e", "c": "e"}, ["a", "b", "c"]),
     ],
 )
 def test_names_in_place_of_others(names, columns, expected):
-    assert renamed(names, columns, Path("a.csv")) == expected
+    assert [each.name for each in renamed(names, columns, Path("a.csv"))] == expected
 
 
 @pytest.mark.parametrize(

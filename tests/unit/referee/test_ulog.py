@@ -208,6 +208,112 @@ def test_the_older_message_holds_innovations_and_variances(tmp_path):
         read_innovations(path)
 
 
+# --- what is fused -------------------------------------------------------------------------------------
+
+
+def flag(log, stamp, instance=0, late=100, **flags):
+    """The flags of the EKF2 as they are after the data of ``stamp``, us, published ``late`` us later."""
+    stamps = {"timestamp": ("<Q", stamp + late), "timestamp_sample": ("<Q", stamp)}
+    fields = {name: ("<B", value) for name, value in flags.items()}
+    log.other("estimator_status_flags", stamps | fields, instance)
+
+
+@pytest.mark.parametrize(
+    "sensor, size, flags",
+    [
+        ("gps_hpos", 2, {"cs_gps": 1}),
+        ("gps_hpos", 2, {"cs_gnss_pos": 1}),
+        ("gps_vpos", 1, {"cs_gps_hgt": 1}),
+        ("baro_vpos", 1, {"cs_baro_hgt": 1}),
+        ("mag_field", 3, {"cs_mag_3d": 1, "cs_mag": 0}),
+        ("mag_field", 3, {"cs_mag_3d": 0, "cs_mag": 1}),
+    ],
+)
+def test_what_is_not_fused_by_its_flag_does_not_count(tmp_path, sensor, size, flags):
+    """The flags are logged as they change; between two messages those before hold, before the first one the first."""
+    own, variance = draws(steps=20, n=size)
+    own[:5] = -1e6
+    log = flight(own, variance, sensor)
+    none = dict.fromkeys(flags, 0)
+    for k, values in ((2, none), (5, flags), (12, none), (17, flags)):
+        flag(log, 10**7 + k * STEP, **values)
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    idle = np.isin(np.arange(20), [0, 1, 2, 3, 4, 12, 13, 14, 15, 16])
+    assert (found.dof == np.where(idle, 0, size)).all()
+    assert_allclose(found.nis[~idle], (own**2 / variance).sum(axis=1)[~idle], rtol=1e-5)
+    assert f"10 messages do not count, as the EKF2 did not fuse the sensor ({', '.join(flags)} 0)" in found.notes[-1]
+
+
+def test_flags_of_others_change_nothing(tmp_path):
+    own, variance = draws(steps=6)
+    log = flight(own, variance)
+    flag(log, 10**7, cs_opt_flow=0, cs_gps_hgt=0)
+    flag(log, 10**7, instance=1, cs_opt_flow=0, cs_gps_hgt=0)
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    assert (found.dof == 2).all()
+    assert len(found.notes) == 1
+
+
+def test_flags_are_those_of_the_same_instance(tmp_path):
+    own, variance = draws(steps=6)
+    log = Flight()
+    for k in range(6):
+        for instance in (0, 1):
+            log.both(10**7 + k * STEP, {"gps_hpos": (own[k], variance[k])}, instance)
+    flag(log, 10**7, instance=1, cs_gps=1)
+    flag(log, 10**7, instance=0, cs_gps=0)
+    path = log.write(tmp_path / "a.ulg")
+    assert (read_innovations(path, run=1).dof == 2).all()
+    with pytest.raises(InputError, match=r"a\.ulg: holds no innovation with a variance; nothing was fused"):
+        read_innovations(path, run=0)
+
+
+def test_a_sensor_that_no_flag_ever_fuses_is_refused(tmp_path):
+    log = Flight()
+    for k in range(6):
+        log.both(10**7 + k * STEP, {"gps_hpos": ((1.0, k), (1.0, 1.0)), "baro_vpos": (k, 1.0)})
+    flag(log, 10**7, cs_gps=0, cs_baro_hgt=1)
+    with pytest.raises(InputError, match=r"--filter gps_hpos: is never fused in .*; there are: baro_vpos"):
+        read_innovations(log.write(tmp_path / "a.ulg"), "gps_hpos")
+    assert read_innovations(tmp_path / "a.ulg").name == "baro_vpos"
+
+
+@pytest.mark.parametrize("bit, sensor", [(2, "gps_hpos"), (11, "gps_vpos"), (9, "baro_vpos"), (5, "mag_field")])
+def test_bits_of_the_status_stand_for_flags(tmp_path, bit, sensor):
+    log = Flight(sample=False)
+    for k in range(8):
+        log.both(10**7 + k * STEP, {sensor: (1.0 + k, 4.0)})
+        mode = 1 << bit if k >= 3 else 0xFFFFFFFF ^ (1 << bit)
+        log.other("estimator_status", {"timestamp": ("<Q", 10**7 + k * STEP + 40), "control_mode_flags": ("<I", mode)})
+    found = read_innovations(log.write(tmp_path / "a.ulg"), sensor)
+    assert (np.isnan(found.nis) == (np.arange(8) < 3)).all()
+    assert "3 messages do not count" in found.notes[-1]
+
+
+@pytest.mark.parametrize("clock", [0, 7])
+def test_one_message_needs_no_partner_though_its_clock_stands_still(tmp_path, clock):
+    """As in the sample log of pyulog, whose 682 messages were one."""
+    own, variance = draws(steps=300, n=1)
+    log = Flight()
+    for y, S in zip(own[:, 0], variance[:, 0], strict=True):
+        fields = {"timestamp": ("<Q", clock), "hagl_innov": ("<f", y), "hagl_innov_var": ("<f", S)}
+        log.other("ekf2_innovations", fields)
+    log.other("estimator_status", {"timestamp": ("<Q", 5), "control_mode_flags": ("<I", 0)})
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    assert_allclose(found.nis, own[:, 0] ** 2 / variance[:, 0], rtol=1e-5)
+    assert np.isnan(found.t).all()
+    assert not any("partner" in note for note in found.notes)
+    assert watch(found, make_monitor("optimal", false_alarm=1e-5)).alarm is None
+
+
+def test_two_topics_whose_clock_stands_still_have_no_partners(tmp_path):
+    log = Flight()
+    for k in range(5):
+        log.both(0, {"gps_hpos": ((1.0, k), (1.0, 1.0))})
+    with pytest.raises(InputError, match=r"a\.ulg: the timestamps of estimator_innovations are all 0 s"):
+        read_innovations(log.write(tmp_path / "a.ulg"))
+
+
 def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):
     """False-alarm rate 1e-3 of the mission is the tool's; here the innovations are their own quantiles."""
     values = np.sqrt(stats.chi2.ppf((np.arange(200) * 77 % 200 + 0.5) / 200, 1))[:, None]

@@ -138,6 +138,34 @@ def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_any_dummy(tmp_
         assert 2.5 < np.nanmean(record.nees) < 3.5
 
 
+@pytest.mark.parametrize("name", ["speed", "turn_rate", "linear_y", "angular_z"])
+def test_the_twist_of_odometry_makes_groups(tmp_path, name):
+    """Of two messages with one stamp the first counts, with its own twist."""
+    drive = Drive()
+    drive.twist = np.random.default_rng().normal(size=(STEPS, 6))
+    drive.t = drive.t.copy()
+    drive.t[5] = drive.t[4]
+    bag = write(tmp_path / "drive", 2, "odometry", drive)
+    [r] = read_recordings(bag, truth_topic="map:body", by=name)
+    linear, angular = np.delete(drive.twist, 5, axis=0).reshape(-1, 2, 3).swapaxes(0, 1)
+    expected = {
+        "speed": np.linalg.norm(linear, axis=1),
+        "turn_rate": np.linalg.norm(angular, axis=1),
+        "linear_y": linear[:, 1],
+        "angular_z": angular[:, 2],
+    }
+    assert_allclose(r.by[0], expected[name], rtol=1e-12)
+    assert len(r.groups.names) == 5
+
+
+def test_a_column_that_a_bag_does_not_hold(tmp_path):
+    has = "there are: speed, turn_rate, linear_x, linear_y, linear_z, angular_x"
+    for kind, truth, said in (("odometry", "map:body", has), ("pose", "/vicon", "has no columns of its own")):
+        bag = write(tmp_path / kind, 2, kind, Drive())
+        with pytest.raises(InputError, match=rf"--by v: .*{kind}.*{said}"):
+            read_recordings(bag, truth_topic=truth, by="v")
+
+
 def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
     drive = Drive()
     drive.t = drive.t.copy()

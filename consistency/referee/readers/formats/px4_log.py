@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     Source: docs.px4.io, "ULog File Format" and "EstimatorInnovations (UORB message)"; the older message of PX4,
     ekf2_innovations.msg, whose first six are of velocity and position, north, east, down: ``vel``, ``hpos``, ``vpos``.
     """
-    log = _loaded(path)
+    log = loaded(path, [*TOPICS, OLD, FLAGS, STATUS])
     innovations, variances, flags = _topics(path, log, instance)
     pairs = _paired(path, innovations, variances)
     pairs.require_variances(path, VARIANCES, ", field '{field}' at {t}: {value} is below 0")
@@ -108,7 +109,8 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     return numbered_log(sensor, pairs.t, nis, dof, notes)
 
 
-def _loaded(path: Path) -> Any:
+def loaded(path: Path, topics: Sequence[str]) -> Any:
+    """The messages of some topics of a log; raises InputError where it cannot be read."""
     try:
         from pyulog import ULog
     except ImportError:
@@ -117,7 +119,7 @@ def _loaded(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     refusal = "cannot be read as a ULog, damaged or cut short"
     with reading(path, refusal), path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-        return ULog(file, [*TOPICS, OLD, FLAGS, STATUS])  # prints what it skips
+        return ULog(file, list(topics))  # prints what it skips
 
 
 def _topics(path: Path, log: Any, instance: int | None) -> tuple[Fields, Fields, Fields]:
@@ -188,8 +190,8 @@ def _clock(path: Path, *topics: Fields) -> str:
 
 def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
     clock = _clock(path, innovations, variances)
-    t = _times(path, INNOVATIONS, innovations[clock])
-    other = _times(path, VARIANCES, variances[clock])
+    t = times_of(path, INNOVATIONS, innovations[clock])
+    other = times_of(path, VARIANCES, variances[clock])
     stands = len(t) > 1 and t[0] == t[-1]
     if innovations[clock] is variances[clock]:  # of one message
         rows = match = np.arange(len(t))
@@ -210,7 +212,8 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
     return Pairs(np.full(len(t), np.nan) if stands else t[rows], own, of, len(t) + len(other) - 2 * len(rows))
 
 
-def _times(path: Path, topic: str, stamps: Array) -> Array:
+def times_of(path: Path, topic: str, stamps: Array) -> Array:
+    """Seconds of timestamps in us, (N,), which must not go back."""
     require_in_order(path, topic, stamps.astype(np.int64))
     return stamps.astype(float) * MICRO
 

@@ -238,6 +238,56 @@ def test_where_nothing_moves_there_is_none(rng):
         clock_shift("est", still, "estimate")
 
 
+def with_covariance(run, scale):
+    return replace(run, covariance=run.covariance * scale)
+
+
+@pytest.mark.parametrize("offset", [0.35, -0.28, 0.6])
+def test_an_offset_is_found_beside_a_covariance_that_is_far_too_small(rng, offset):
+    """By 1e4: every estimate is beyond 100 times its NEES, at the right offset, too. With noise it spreads by 2 ms."""
+    runs = [with_covariance(run_of(rng, offset), 1e-4) for _ in range(8)]
+    assert clock_shift("est", runs, "estimate")[0] == pytest.approx(offset, abs=0.02)
+    assert "--time-offset" in clock_shift("est", runs, None)[1][0]
+
+
+def test_broken_estimates_decide_nothing(rng):
+    """A tenth of the rows, off by 1e4 sigma along x alone."""
+    runs = [run_of(rng, 0.04) for _ in range(20)]
+    for run in runs:
+        run.estimate[::10, 0] += 1e4 * SIGMA[0]
+    assert offset_of(samples_of(runs)).value == pytest.approx(0.04, abs=0.02)
+
+
+def test_components_that_are_not_judged_say_nothing(rng):
+    runs = [run_of(rng, 0.1) for _ in range(8)]
+    for run in runs:
+        run.estimate[:, 1] += 1e3 * rng.normal(size=100)
+    assert offset_of(samples_of(runs, [0, 2])).value == pytest.approx(0.1, abs=0.03)
+    assert samples_of(runs, [0, 2])[0].axes == [0, 2]
+
+
+def test_a_component_that_never_changes_in_the_estimates_says_nothing(rng):
+    """A heading of 0 throughout, with errors of many sigma."""
+    runs = [run_of(rng, 0.1) for _ in range(8)]
+    still = [replace(run, estimate=run.estimate * [1.0, 1.0, 0.0]) for run in runs]
+    [first, *_] = samples_of(still)
+    assert first.axes == [0, 1]
+    P, e = runs[0].covariance[:, :2, :2], still[0].errors(0.0)[:, :2]
+    nees = np.einsum("ki,kij,kj->k", e, np.linalg.inv(P), e)
+    assert_allclose(first.squares(0.0), nees / 2.0)
+    assert samples_of(still, [2])[0].axes == [2]  # nothing else is judged
+
+
+def test_of_many_runs_some_are_looked_at(rng):
+    runs = [replace(run_of(rng, 0.04), run=number) for number in range(3)]
+    many = [replace(runs[k % 3], run=k) for k in range(200)]
+    numbers = [sample.poses.run for sample in samples_of(many)]
+    assert len(numbers) == clock_offset.RUNS == 60
+    assert numbers == sorted(set(numbers))
+    assert (numbers[0], numbers[-1]) == (0, 199)
+    assert len(samples_of(many[:60])) == 60
+
+
 # --- files ------------------------------------------------------------------------------------------
 
 

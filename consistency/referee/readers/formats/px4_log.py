@@ -35,7 +35,7 @@ MODE = "control_mode_flags"
 BITS = {
     "cs_gps": 2, "cs_opt_flow": 3, "cs_mag_hdg": 4, "cs_mag_3d": 5, "cs_baro_hgt": 9, "cs_rng_hgt": 10,
     "cs_gps_hgt": 11, "cs_ev_pos": 12, "cs_ev_yaw": 13, "cs_ev_hgt": 14, "cs_fuse_beta": 15, "cs_fuse_aspd": 19,
-    "cs_gps_yaw": 22, "cs_ev_vel": 24,
+    "cs_gps_yaw": 22, "cs_ev_vel": 24, "cs_gravity_vector": 34, "cs_mag": 35, "cs_gnss_vel": 44,
 }  # fmt: skip
 GPS_VELOCITY = ("cs_gps", "cs_gnss_vel")
 HEIGHTS = ("cs_baro_hgt", "cs_rng_hgt", "cs_gps_hgt", "cs_ev_hgt")

@@ -14,7 +14,7 @@ from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.formats.tum import SpaceRun, poses_without_covariances, space_estimator
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import Estimator, nearest, truth_at
+from consistency.referee.readers.truth_matching import Estimator, finite_rows, nearest, truth_at
 from consistency.referee.types import Array, Indices
 
 POSITION, ATTITUDE, STATES = "vehicle_local_position", "vehicle_attitude", "estimator_states"
@@ -55,7 +55,7 @@ def read_simulation(path: Path, r: Reading, poses_alone: bool = False) -> list[E
     if own.origin is not None and true.origin is not None:
         between = axes_at(own.origin) @ (centred(true.origin) - centred(own.origin))
         place[:, :3] += between[NED] * [1.0, 1.0, -1.0]
-    states = _topic(path, log, STATES)
+    states = _topic(path, log, STATES, *(f"covariances[{i}]" for i in range(10)))
     variances = _variances(path, own, states)
     values = np.column_stack([own.t, own.poses, np.sqrt(variances)])
     note = f"{path}: read as a log of PX4 in simulation, {POSITION} and {ATTITUDE} with the variances of {STATES}"
@@ -65,13 +65,16 @@ def read_simulation(path: Path, r: Reading, poses_alone: bool = False) -> list[E
     return [poses_without_covariances(path, [run], r) if poses_alone else space_estimator(path, [run], r, WHY)]
 
 
-def _topic(path: Path, log: Any, name: str) -> Fields:
+def _topic(path: Path, log: Any, name: str, *needed: str) -> Fields:
     """Fields of the messages of the first instance of a topic."""
     found = sorted((each.multi_id, k) for k, each in enumerate(log.data_list) if each.name == name)
     if not found:
         advice = "a simulation logs its truth; innovations of any log are for 'consistency monitor'"
         raise InputError(f"{path}: holds no message '{name}'; {advice}")
     data: Fields = log.data_list[found[0][1]].data
+    for field in ("timestamp", *needed):
+        if field not in data:
+            raise InputError(f"{path}: message '{name}' lacks the field '{field}'")
     return data
 
 
@@ -83,15 +86,15 @@ def _stamps(path: Path, name: str, data: Fields) -> Array:
 
 def _track(path: Path, log: Any, ending: str) -> Track:
     """Positions that are valid, each with the attitude at its time."""
-    position = _topic(path, log, POSITION + ending)
-    attitude = _topic(path, log, ATTITUDE + ending)
+    position = _topic(path, log, POSITION + ending, *"xyz")
+    attitude = _topic(path, log, ATTITUDE + ending, *(f"q[{i}]" for i in range(4)))
     t, first = np.unique(_stamps(path, POSITION + ending, position), return_index=True)
     at, rows = np.unique(_stamps(path, ATTITUDE + ending, attitude), return_index=True)
     turns = np.column_stack([np.zeros((len(at), 3)), *(attitude[f"q[{i}]"][rows].astype(float) for i in (1, 2, 3, 0))])
-    bad = not_unit(turns)[0]
+    bad = not_unit(turns)[0] | ~finite_rows(turns)
     known = truth_at(t, at[~bad], turns[~bad], "spatial", 0.1) if not bad.all() else None
     place = np.column_stack([position[axis][first].astype(float) for axis in "xyz"])
-    valid = np.isfinite(place).all(axis=1)
+    valid = finite_rows(place)
     for flag in ("xy_valid", "z_valid"):
         valid &= position.get(flag, np.ones(len(t)))[first] != 0
     kept = np.empty(0, int) if known is None else known.rows[valid[known.rows]]

@@ -51,12 +51,15 @@ def messages(store, kind, drive, ros1):
         point = T["geometry_msgs/msg/Point"](*map(float, values[:3]))
         return T["geometry_msgs/msg/Pose"](point, T["geometry_msgs/msg/Quaternion"](*map(float, values[3:])))
 
-    zero = T["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     stated = T["geometry_msgs/msg/PoseWithCovariance"]
-    for t, values in zip(drive.t, drive.own, strict=True):
+    twists = getattr(drive, "twist", np.zeros((len(drive.t), 6)))
+    for t, values, moving in zip(drive.t, drive.own, twists, strict=True):
         content = stated(pose(values), drive.P.ravel())
         if kind == "odometry":
-            twist = T["geometry_msgs/msg/TwistWithCovariance"](T["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36))
+            linear, angular = (T["geometry_msgs/msg/Vector3"](*part) for part in moving.reshape(2, 3).tolist())
+            twist = T["geometry_msgs/msg/TwistWithCovariance"](
+                T["geometry_msgs/msg/Twist"](linear, angular), np.zeros(36)
+            )
             message = T["nav_msgs/msg/Odometry"](header(t, "map"), "base", content, twist)
             yield "/odom", "nav_msgs/msg/Odometry", late(t), message
         else:

@@ -41,6 +41,20 @@ class Flight:
         numbers = np.concatenate([part.ravel() for part in each]).astype("<f4").tobytes()
         self.body += message("D", struct.pack("<H", self.ids[key]) + stamps + numbers)
 
+    def other(self, topic, fields, instance=0):
+        """One message of another topic: fields with their types, as ("Q", 7) of eight bytes or ("3f", (1, 2, 3))."""
+        types = {"Q": "uint64_t", "I": "uint32_t", "B": "uint8_t", "f": "float", "d": "double"}
+        key = topic, instance
+        if key not in self.ids:
+            if not any(name == topic for name, _ in self.ids):
+                sizes = {name: f"[{kind[:-1]}]" if kind[:-1] else "" for name, (kind, _) in fields.items()}
+                text = "".join(f"{types[kind[-1]]}{sizes[name]} {name};" for name, (kind, _) in fields.items())
+                self.head += message("F", f"{topic}:{text}".encode())
+            self.ids[key] = len(self.ids)
+            self.body += message("A", struct.pack("<BH", instance, self.ids[key]) + topic.encode())
+        data = b"".join(struct.pack(f"<{kind}", *np.atleast_1d(value)) for kind, value in fields.values())
+        self.body += message("D", struct.pack("<H", self.ids[key]) + data)
+
     def both(self, stamp, values, instance=0):
         """Innovations and variances of one step, by field."""
         for k, topic in enumerate(self.topics):

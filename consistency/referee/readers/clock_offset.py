@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize
@@ -11,14 +11,16 @@ from scipy import optimize
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.errors import InputError
-from consistency.referee.readers.truth_matching import Poses, finite_rows
+from consistency.referee.readers.runs_to_record import unchanging
+from consistency.referee.readers.truth_matching import Poses, evenly, finite_rows, submatrices
 from consistency.referee.types import Array
 
 REACH = 1.0  # s, the largest offset that is looked for
 STEP = 1e-3  # s, over which the motion of the truth is taken
 MOST = 4000  # estimates that are looked at, of all runs together
+RUNS = 60  # runs that are looked at: their offset adds less than 1 / 60 to the NEES of a whole run
 PARTS = 12  # that a single run is cut into
-CAP = 100.0  # NEES over its degrees of freedom, beyond which an estimate counts no more: a broken one decides nothing
+CAP = 100.0  # NEES over its degrees of freedom beyond which an estimate does not count: a broken one decides nothing
 GROSS = 4.0  # mean NEES over its degrees of freedom that a right single run hardly has
 SHIFTS = np.geomspace(0.004, REACH, 12)
 GRID = np.concatenate([-SHIFTS[::-1], [0.0], SHIFTS])  # s, offsets of which the best is refined
@@ -48,12 +50,58 @@ class Offset:
         return f"{self.value:.4g} s [{self.low:.4g}, {self.high:.4g}]"
 
 
-def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) -> tuple[float, list[str]]:
+@dataclass(frozen=True)
+class Sample:
+    """Estimates of a run by which clocks are compared, N of them, in some components of their error."""
+
+    poses: Poses
+    axes: Sequence[int]  # n of them
+    factors: Array  # (N, n, n), inverse Cholesky factors of their covariances; NaN where one is not positive definite
+
+    def whitened(self, error: Array) -> Array:
+        """Errors (N, all components) of these components in units of their covariance, (N, n)."""
+        return np.asarray(np.einsum("kij,kj->ki", self.factors, error[:, list(self.axes)]))
+
+    def squares(self, shift: float) -> Array:
+        """NEES over its degrees of freedom with the truth ``shift`` s later, (N,); NaN where there is none."""
+        return np.asarray(np.square(self.whitened(self.poses.errors(shift))).mean(axis=1))
+
+    def some(self, most: int) -> Sample:
+        """At most ``most`` estimates, evenly chosen."""
+        rows = evenly(len(self.factors), most)
+        return replace(self, poses=self.poses.of_rows(rows), factors=self.factors[rows])
+
+
+def sample_of(poses: Poses, axes: Sequence[int]) -> Sample:
+    """The finite estimates of a run, with the factors of their covariances."""
+    poses = poses.sound()
+    P = submatrices(poses.covariance, axes)
+    columns = [whiten(np.broadcast_to(unit, P.shape[:2]), P) for unit in np.eye(len(axes))]
+    return Sample(poses, axes, np.stack(columns, axis=-1))
+
+
+def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> list[Sample]:
+    """At most ``RUNS`` runs, evenly chosen, in the judged components that change in their estimates.
+
+    A component that never changes, as the height of a robot in the plane, says nothing about time, and its error may be
+    far beyond its variance.
+    """
+    if judged is None:
+        judged = range(runs[0].covariance.shape[-1])
+    idle = unchanging(runs, [p.estimate for p in runs])
+    axes = [i for i in judged if not idle[i]] or list(judged)
+    return [sample_of(runs[k], axes) for k in evenly(len(runs), RUNS)]
+
+
+def clock_shift(
+    name: str, runs: Sequence[Poses], wanted: float | str | None, judged: Sequence[int] | None = None
+) -> tuple[float, list[str]]:
     """Time to add to the timestamps of the estimates, s, and notes on it.
 
     Parameters
     ----------
     wanted : seconds to add; "estimate"; or None, which adds nothing but reports an offset if one is found
+    judged : components of the error that are judged; None for all
 
     Raises
     ------
@@ -62,9 +110,10 @@ def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) ->
     """
     if isinstance(wanted, float):
         return wanted, [f"{name}: {wanted:g} s are added to the timestamps of the estimates"] if wanted else []
-    found = offset_of(runs)
+    samples = samples_of(runs, judged)
+    found = offset_of(samples)
     if wanted is None:
-        if found is None or not found.found or not shows_in_estimates(runs, found.value):
+        if found is None or not found.found or not shows_in_estimates(samples, found.value):
             return 0.0, []
         share = f"{100.0 * found.explained:.0f} % of the NEES; if so, add --time-offset {found.value:.4g}"
         return 0.0, [f"{name}: the clocks of estimates and truth seem to differ by {found}, which makes {share}"]
@@ -76,35 +125,40 @@ def clock_shift(name: str, runs: Sequence[Poses], wanted: float | str | None) ->
     ]
 
 
-def offset_of(runs: Sequence[Poses]) -> Offset | None:
+def offset_of(samples: Sequence[Sample]) -> Offset | None:
     """The offset of the clocks that fits best; None where nothing moves, or the data are too few.
 
     The offset minimises the NEES (capped) within a second; one Gauss-Newton step in each run, or in each of
     ``PARTS`` parts of a single one, tells how far runs agree on it (Student's t).
     """
+    most = max(MOST // len(samples), 50)
     some = []
     judged = []
-    for poses in runs:
-        poses = poses.some(max(MOST // len(runs), 50)).sound()
-        if len(poses.t):
-            some.append(poses)
-            whitened = whiten(poses.errors(), poses.covariance)
-            judged.append(np.isfinite(np.square(whitened).sum(axis=1)))
+    for sample in (each.some(most) for each in samples):
+        known = np.isfinite(sample.squares(0.0))
+        if known.any():
+            some.append(sample)
+            judged.append(known)
     if not some:
         return None
+    weights = np.concatenate([np.full(known.sum(), 1.0 / known.sum()) for known in judged]) / len(some)
 
-    def size(shift: float) -> float:
-        sizes = [_size(poses, shift, those) for poses, those in zip(some, judged, strict=True)]
-        return float(np.mean(sizes))
+    def squares(shift: float) -> Array:
+        return np.concatenate([each.squares(shift)[known] for each, known in zip(some, judged, strict=True)])
 
-    sizes = np.array([size(shift) for shift in GRID])
-    at_rest = size(0.0)
-    moves = np.isfinite(sizes).any() and np.nanmax(sizes) - np.nanmin(sizes) > 1e-9
-    if not moves or not at_rest > 0.0:  # or no error is there to explain
+    def size(values: Array) -> float:
+        """Mean of the runs, capped, as an estimate is without a truth."""
+        return float(weights @ np.minimum(np.where(np.isfinite(values), values, np.inf), cap))
+
+    on_grid = list(map(squares, GRID))
+    cap = min(map(cap_of, on_grid))
+    sizes = np.array(list(map(size, on_grid)))
+    at_rest = size(squares(0.0))
+    if not np.ptp(sizes) > 1e-9 or not at_rest > 0.0:  # nothing moves, or no error is there to explain
         return None
-    value = refined(size, sizes, 1e-5)
+    value = refined(lambda shift: size(squares(shift)), sizes, 1e-5)
     parts = 1 if len(some) > 1 else PARTS
-    each = np.concatenate([steps_of(poses, value, parts) for poses in some])
+    each = np.concatenate([steps_of(sample, value, parts) for sample in some])
     each = value + each[np.isfinite(each)]
     if len(each) < 3:
         return None
@@ -114,10 +168,16 @@ def offset_of(runs: Sequence[Poses]) -> Offset | None:
     if spread > 0:
         ratio = abs(each.mean()) / spread
         p = 2.0 * float(distributions.t.sf(ratio, len(each) - 1))
-    left = size(value)
+    left = size(squares(value))
     is_gross = at_rest > GROSS and left < 0.5 * at_rest
     alone = len(some) == 1 and not is_gross
     return Offset(value, value - reach, value + reach, p, 1.0 - left / at_rest, alone)
+
+
+def cap_of(squares: Array) -> float:
+    """Size beyond which an estimate does not count: ``CAP`` times what is usual, which is at least 1."""
+    finite = squares[np.isfinite(squares)]
+    return CAP * max(1.0, float(np.median(finite))) if len(finite) else np.inf
 
 
 def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> float:
@@ -128,7 +188,7 @@ def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> f
     return float(found.x if found.fun < sizes[best] else GRID[best])
 
 
-def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:
+def shows_in_estimates(samples: Sequence[Sample], value: float) -> bool:
     """Whether the motion of the estimates, in place of that of the truth, tells of an offset of the same sign.
 
     A right filter's error is correlated with the true motion, which may look like an offset, and with no earlier
@@ -138,8 +198,8 @@ def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:
     The motion between the two rows before is the instrumental variable of a linear regression. Its standard error is
     found by leaving out each run in turn, or each part of a single one (jackknife); Student's t.
     """
-    parts = 1 if len(runs) > 1 else PARTS
-    sums = np.concatenate([_estimate_sums(poses.sound(), parts) for poses in runs])
+    parts = 1 if len(samples) > 1 else PARTS
+    sums = np.concatenate([_estimate_sums(sample, parts) for sample in samples])
     with np.errstate(divide="ignore", invalid="ignore"):  # where nothing moves, or in one run alone
         top, bottom = sums.sum(axis=0)
         without_one = (sums[:, 0] - top) / (bottom - sums[:, 1])
@@ -148,39 +208,28 @@ def shows_in_estimates(runs: Sequence[Poses], value: float) -> bool:
         return bool(np.sign(-value) * top / bottom > least)
 
 
-def _size(poses: Poses, shift: float, judged: Array) -> float:
-    """Mean NEES of ``judged`` over its degrees of freedom, capped, as it is where there is no truth then."""
-    if not judged.any():
-        return np.nan
-    w = whiten(poses.errors(shift), poses.covariance)
-    nees = np.square(w).sum(axis=1) / w.shape[1]
-    capped = np.minimum(np.where(np.isfinite(nees), nees, CAP), CAP)
-    return float(capped[judged].mean())
-
-
-def steps_of(poses: Poses, shift: float, parts: int) -> Array:
+def steps_of(sample: Sample, shift: float, parts: int) -> Array:
     """Gauss-Newton step from ``shift`` in each part, s; NaN where nothing moves."""
-    e, v = _errors_and_motion(poses, shift)
+    e, v = _errors_and_motion(sample, shift)
     sums = _sums_of_parts(v, e, v, parts)
     return np.array([-top / bottom if bottom > 0 else np.nan for top, bottom in sums])
 
 
-def _estimate_sums(poses: Poses, parts: int) -> Array:
+def _estimate_sums(sample: Sample, parts: int) -> Array:
     """Sums as in :func:`_sums_of_parts`, along the motion of the estimates between the two rows before."""
-    e, v = _errors_and_motion(poses, 0.0)
-    before = np.full_like(e, np.nan)
+    e, v = _errors_and_motion(sample, 0.0)
+    poses = sample.poses
     rows = np.arange(len(e) - 2)
+    before = np.full(poses.covariance.shape[:2], np.nan)
     before[2:] = poses.error_of(rows, poses.estimate[1:-1])
-    along = whiten(before, poses.covariance)
-    return _sums_of_parts(along, e, v, parts)
+    return _sums_of_parts(sample.whitened(before), e, v, parts)
 
 
-def _errors_and_motion(poses: Poses, shift: float) -> tuple[Array, Array]:
+def _errors_and_motion(sample: Sample, shift: float) -> tuple[Array, Array]:
     """Errors at ``shift`` and their derivative by it, both whitened, (N, n)."""
-    later = poses.errors(shift + STEP)
-    earlier = poses.errors(shift - STEP)
-    moved = (later - earlier) / (2.0 * STEP)
-    return whiten(poses.errors(shift), poses.covariance), whiten(moved, poses.covariance)
+    errors = sample.poses.errors
+    moved = (errors(shift + STEP) - errors(shift - STEP)) / (2.0 * STEP)
+    return sample.whitened(errors(shift)), sample.whitened(moved)
 
 
 def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
@@ -188,6 +237,7 @@ def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
     of_errors = (along * e).sum(axis=1)
     of_motion = (along * v).sum(axis=1)
     products = np.column_stack([of_errors, of_motion])
-    fine = finite_rows(products) & (np.square(e).mean(axis=1) < CAP)
+    squares = np.square(e).mean(axis=1)
+    fine = finite_rows(products) & (squares < cap_of(squares))
     groups = np.array_split(np.flatnonzero(fine), parts)
     return np.array([products[rows].sum(axis=0) for rows in groups])

@@ -16,14 +16,22 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
-from consistency.referee.readers.truth_matching import Estimator, at, finite_rows, submatrices
+from consistency.referee.readers.truth_matching import Estimator, Poses, at, finite_rows, submatrices
 from consistency.referee.types import Array, Failure, Indices
 
 STILL = (
     "not estimated and left out: their errors are 0 in every row, and their variances one constant each, as for a "
     "robot in the plane"
 )
+LEVEL = (
+    "not estimated and left out, as by --axes {}: they never change in truth and estimates, as for a robot in the "
+    "plane, and their variances are one constant each; --axes {} judges them, too"
+)
+FIXED = "never change in the estimates, but in the truth or in their variance; if they are not estimated, add --axes {}"
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
+NO_CHANGE = 1e-6  # m or rad: rounding, to four bytes or in a text, of a height or a tilt that never changes
+FEWEST = 3  # rows of a run that show that
+BESIDE = 1.0  # s, of the truth before and after the estimates
 ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
 
 
@@ -304,6 +312,65 @@ def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence
     names = ", ".join(np.array(e.axes)[part[idle]])
     note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
     return part[~idle].tolist(), [note]
+
+
+def level_components(e: Estimator, judged: Sequence[int]) -> tuple[list[int], list[str]]:
+    """Components, of those judged, without a z, roll or pitch that a robot in the plane does not estimate, and notes.
+
+    Such a component never changes in the truth nor in the estimates, which may differ by a constant, and its variance
+    is one constant. The constant error of a component that moves is a bias.
+    """
+    part = list(judged)
+    near = []
+    for p in e.runs:
+        from_, to = p.t.min(initial=np.inf) - BESIDE, p.t.max(initial=-np.inf) + BESIDE
+        near.append(p.truth[(p.true_t >= from_) & (p.true_t <= to)])
+    fixed = unchanging(e.runs, [p.estimate for p in e.runs])[part]
+    variance = np.concatenate([p.variances[p.stated][:, part] for p in e.runs])
+    variance = variance[~np.isnan(variance).any(axis=1)]
+    constant = np.isclose(variance, variance[:1], rtol=NO_ERROR, atol=0.0).all(axis=0)
+    none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
+    idle = fixed & constant & unchanging(e.runs, near)[part]
+    if not fixed.any() or idle.all() or (none & ~idle).any():  # a variance may be in the wrong row
+        return part, []
+    notes = []
+    names = np.array(e.axes)[part]
+    for which, what, left in ((idle, f"are {LEVEL}", ~idle), (fixed & ~idle, FIXED, ~fixed)):
+        if which.any():
+            notes.append(f"{e.said}: {', '.join(names[which])} {what.format(','.join(names[left]), ','.join(names))}")
+    return np.array(part)[~idle].tolist(), notes
+
+
+def unchanging(runs: Sequence[Poses], states: Sequence[Array]) -> Indices:
+    """Which components (n,) are a third coordinate, or roll and pitch, that never change in any run.
+
+    Runs that are too short, or that do not move along the first two coordinates, do not count.
+
+    Parameters
+    ----------
+    states : (k, m) of each run, estimates or truth
+    """
+    n = runs[0].covariance.shape[-1]
+    found = np.zeros((0, n), bool)
+    for p, values in zip(runs, states, strict=True):
+        values = values[finite_rows(values)]
+        if len(values) < FEWEST or _same(values[:, :2]):
+            continue
+        still = np.zeros(n, bool)
+        still[2:3] = _same(values[:, 2:3])
+        if p.manifold == "spatial":
+            x, y, z, w = values[:, 3:7].T
+            up = np.column_stack([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)])
+            still[3:5] = _same(up)  # the world's z axis in those of the body
+            if p.convention in ("left", "right"):  # mix the axes unless the body's z axis is the world's
+                still[2] &= np.abs(up[:, :2]).max() <= NO_CHANGE
+        found = np.vstack([found, still])
+    return np.asarray(found.all(axis=0) & bool(len(found)))
+
+
+def _same(values: Array) -> bool:
+    """Whether each column has the same value in all rows (k, m)."""
+    return bool(np.ptp(values, axis=0).max(initial=0.0) <= NO_CHANGE)
 
 
 def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:

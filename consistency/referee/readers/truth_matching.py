@@ -281,10 +281,7 @@ class Poses:
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""
-        if len(self.t) <= most:
-            return self
-        places = np.linspace(0, len(self.t) - 1, most)
-        return self.of_rows(np.unique(places.astype(int)))
+        return self.of_rows(evenly(len(self.t), most))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
@@ -319,6 +316,13 @@ def at(values: Array | None, rows: Any) -> Array | None:
     if values is None:
         return None
     return np.asarray(values[rows])
+
+
+def evenly(count: int, most: int) -> Indices:
+    """At most ``most`` of so many places, evenly chosen, the first and the last among them."""
+    if count <= most:
+        return np.arange(count)
+    return np.linspace(0, count - 1, most).astype(np.int64)
 
 
 def finite_rows(values: Array) -> Array:

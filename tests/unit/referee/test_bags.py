@@ -105,6 +105,67 @@ def test_a_robot_in_the_plane_is_judged_in_the_plane(tmp_path, variances, unstat
     assert any(f"the variances of {unstated} are 0, -1" in note for note in r.notes) == bool(unstated)
 
 
+def planar_bags(folder, dummies, *, late=0.0, count=4):
+    """Drives in the plane whose truth is 0.05 m lower and ``late`` s late; variances of z, roll, pitch are dummies."""
+    folder.mkdir()
+    for seed in range(count):
+        drive = Drive(seed)
+        e = drive.error * [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+        true = Rotation.from_quat(drive.true[: 5 * STEPS : 5, 3:])
+        drive.true[:, 2] = -0.05
+        drive.own[:, :3] = drive.true[: 5 * STEPS : 5, :3] - e[:, :3] + [0.0, 0.0, 0.05]
+        drive.own[:, 3:] = (Rotation.from_rotvec(-e[:, 3:]) * true).as_quat()
+        drive.P = np.diag([*SIGMA[:2] ** 2, *dummies, SIGMA[5] ** 2])
+        drive.true_t = drive.true_t + late
+        write(folder / f"{seed}.bag", 1, "pose", drive)
+    return folder
+
+
+@pytest.mark.parametrize("dummies", [(1e-6,) * 3, (0.0, 1e6, 1e6)])
+def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_any_dummy(tmp_path, dummies):
+    """An offset of 0.35 s makes an error of 0.3 m and 0.1 rad; without it NEES is 3, of 600: 0.5 is 5 sigma."""
+    bags = planar_bags(tmp_path / "bags", dummies, late=0.35)
+    [late] = read_recordings(bags, truth_topic="/vicon")
+    assert late.axes == ("x", "y", "yaw")
+    notes = " ".join(late.notes)
+    assert "by --axes x,y,yaw" in notes
+    offset = float(notes.split("--time-offset ")[1].split()[0])
+    assert offset == pytest.approx(0.35, abs=0.01)
+    [right] = read_recordings(bags, truth_topic="/vicon", time_offset=offset)
+    [found] = read_recordings(bags, truth_topic="/vicon", time_offset="estimate", axes=["x", "y", "yaw"])
+    for record in (right, found):
+        assert record.axes == ("x", "y", "yaw")
+        assert 2.5 < np.nanmean(record.nees) < 3.5
+
+
+@pytest.mark.parametrize("name", ["speed", "turn_rate", "linear_y", "angular_z"])
+def test_the_twist_of_odometry_makes_groups(tmp_path, name):
+    """Of two messages with one stamp the first counts, with its own twist."""
+    drive = Drive()
+    drive.twist = np.random.default_rng().normal(size=(STEPS, 6))
+    drive.t = drive.t.copy()
+    drive.t[5] = drive.t[4]
+    bag = write(tmp_path / "drive", 2, "odometry", drive)
+    [r] = read_recordings(bag, truth_topic="map:body", by=name)
+    linear, angular = np.delete(drive.twist, 5, axis=0).reshape(-1, 2, 3).swapaxes(0, 1)
+    expected = {
+        "speed": np.linalg.norm(linear, axis=1),
+        "turn_rate": np.linalg.norm(angular, axis=1),
+        "linear_y": linear[:, 1],
+        "angular_z": angular[:, 2],
+    }
+    assert_allclose(r.by[0], expected[name], rtol=1e-12)
+    assert len(r.groups.names) == 5
+
+
+def test_a_column_that_a_bag_does_not_hold(tmp_path):
+    has = "there are: speed, turn_rate, linear_x, linear_y, linear_z, angular_x"
+    for kind, truth, said in (("odometry", "map:body", has), ("pose", "/vicon", "has no columns of its own")):
+        bag = write(tmp_path / kind, 2, kind, Drive())
+        with pytest.raises(InputError, match=rf"--by v: .*{kind}.*{said}"):
+            read_recordings(bag, truth_topic=truth, by="v")
+
+
 def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
     drive = Drive()
     drive.t = drive.t.copy()

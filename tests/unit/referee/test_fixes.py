@@ -122,6 +122,31 @@ def test_a_solution_against_a_solution(inside, capsys):
     assert "base.pos: x is east, y north, z up from its first place" in err
 
 
+@pytest.mark.parametrize("name", ["Q", "ns", "ratio", "age"])
+def test_columns_of_a_solution_make_groups(name, inside):
+    place, P = flight()
+    rover, base = (
+        Path(solution("rover.pos", place + np.array([1e-7, 1e-7, 0.01]), P)),
+        solution("base.pos", place, 1e-6 * P),
+    )
+    lines = rover.read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith("%  GPST"))
+    names = lines[head][1:].split()
+    column = next(k for k, word in enumerate(names) if word.partition("(")[0] == name) + 1  # a time is two
+    values = []
+    for k in range(head + 1, len(lines)):
+        cells = lines[k].split()
+        values.append(1 + k % 2)
+        cells[column] = str(values[-1])
+        lines[k] = " ".join(cells)
+    rover.write_text("\n".join(lines) + "\n")
+    record = cs.read(rover, truth=base, by=name)
+    assert record.by[0].tolist() == values
+    assert record.groups.names == (f"{name} <= 1", f"{name} > 1")
+    with pytest.raises(cs.InputError, match=r"--by q: .*rover\.pos has no such column; there are: Q, ns, sdn, .*ratio"):
+        cs.read(rover, truth=base, by="q")
+
+
 def test_a_solution_as_the_truth_of_poses(inside):
     """The position of the estimate in the same plane; where it is in another world a note names the remedy."""
     place, P = flight()

@@ -423,6 +423,11 @@ def test_a_trajectory_with_a_table(tmp_path):
     assert record.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
     with pytest.raises(cs.InputError, match="has no columns of its own; --by-file FILE names a table"):
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
+    names = "t,x,y,z,qx,qy,qz,qw,n_matches"
+    named = np.column_stack([estimate, np.arange(400) % 7])
+    np.savetxt(tmp_path / "named.csv", named, delimiter=",", header=names, comments="")
+    record = cs.read(tmp_path / "named.csv", **files, by="n_matches")
+    assert record.by[0, :4].tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_windows_take_the_value_at_their_beginning(tmp_path):

@@ -134,6 +134,97 @@ def test_what_a_planar_robot_does_not_estimate_is_left_out(dummies, suffix, tmp_
     assert asked.covariance.shape[-1] == 6
 
 
+def moved(est, truth, change):
+    """Planar files whose poses ``change`` moves: t, estimates (N, 7) and truth (N, 7) to both."""
+    for path in est.iterdir():
+        rows, true = np.loadtxt(path), np.loadtxt(truth / path.name)
+        rows[:, 1:8], true[:, 1:8] = change(rows[:, 0], rows[:, 1:8], true[:, 1:8])
+        np.savetxt(path, rows)
+        np.savetxt(truth / path.name, true)
+
+
+def tilted(poses, roll, pitch):
+    turn = Rotation.from_quat(poses[:, 3:]) * Rotation.from_euler("xyz", np.column_stack([roll, pitch, 0.0 * roll]))
+    return np.column_stack([poses[:, :3], turn.as_quat()])
+
+
+UP = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+WAVE = 0.01 * np.sin(np.arange(10.0))
+ONE = np.ones(10)
+CONSTANT = {
+    "height": lambda t, own, true: (own + 0.05 * UP, true),
+    "tilt": lambda t, own, true: (own, tilted(true, 0.02 * ONE, -0.03 * ONE)),
+    "both": lambda t, own, true: (tilted(own - 9.0 * UP, 3.0 * ONE, 0.0 * ONE), true),
+    "rounded": lambda t, own, true: ((own + 0.05 * UP).astype(np.float32), true),
+}
+
+
+@pytest.mark.parametrize(
+    "case, dummy", [("height", 1e-6), ("height", 0.0), ("tilt", 1e6), ("both", 1.0), ("rounded", 0.1)]
+)
+def test_what_never_changes_is_left_out_though_it_is_off(case, dummy, tmp_path):
+    est, truth = planar(tmp_path, (dummy,) * 3)
+    moved(est, truth, CONSTANT[case])
+    record = cs.read(est, truth=truth)
+    assert record.axes == ("x", "y", "yaw")
+    [note] = [note for note in record.notes if "not estimated" in note]
+    assert "z, roll, pitch are not estimated and left out, as by --axes x,y,yaw" in note
+    assert_array_equal(record.nees, cs.read(est, truth=truth, axes=["x", "y", "yaw"]).nees)
+    if dummy:
+        assert cs.read(est, truth=truth, axes=["x", "z", "yaw"]).axes == ("x", "z", "yaw")
+
+
+@pytest.mark.parametrize("convention, axes", [("so3", 3), ("right", 4), ("left", 4)])
+def test_a_height_in_tilted_axes_is_not_left_out(convention, axes, tmp_path):
+    """Of two tilts that differ, errors of a group mix the axes."""
+    est, truth = planar(tmp_path, (1e-6,) * 3)
+    moved(est, truth, lambda t, own, true: (tilted(own, 0.2 * ONE, 0.0 * ONE), true))
+    assert len(cs.read(est, truth=truth, error=convention).axes) == axes
+
+
+MOVES = {  # and which components are still left out
+    "a bias of a height that moves": (
+        lambda t, own, true: (own + np.outer(WAVE + 0.05, UP), true + np.outer(WAVE, UP)),
+        2,
+    ),
+    "a height of the truth alone": (lambda t, own, true: (own, true + np.outer(WAVE, UP)), 2),
+    "a height of the estimates alone": (lambda t, own, true: (own + np.outer(WAVE, UP), true), 2),
+    "a roll of the truth": (lambda t, own, true: (own, tilted(true, WAVE, 0.0 * ONE)), 1),
+    "a pitch of the estimates": (lambda t, own, true: (tilted(own, 0.0 * ONE, WAVE), true), 1),
+}
+
+
+@pytest.mark.parametrize("case", MOVES)
+def test_what_moves_in_one_of_both_is_judged(case, tmp_path):
+    est, truth = planar(tmp_path, (1.0, 1.0, 1.0))
+    change, left = MOVES[case]
+    moved(est, truth, change)
+    record = cs.read(est, truth=truth)
+    assert len(record.axes) == 6 - left
+    named = [note for note in record.notes if "never change in the estimates" in note]
+    assert bool(named) == ("of the truth" in case)
+    assert all("--axes x,y" in note for note in named)
+
+
+def test_a_variance_that_changes_is_of_an_estimate(tmp_path):
+    est, truth = planar(tmp_path, (1.0, 1.0, 1.0))
+    for path in est.iterdir():
+        rows = np.loadtxt(path)
+        rows[:, 8 + 14] = np.linspace(1.0, 1.1, len(rows))
+        rows[:, 3] += 0.5
+        np.savetxt(path, rows)
+    record = cs.read(est, truth=truth)
+    assert record.axes == ("x", "y", "z", "yaw")
+    assert any("z never change in the estimates" in note and "add --axes x,y,yaw" in note for note in record.notes)
+
+
+def test_a_robot_that_stands_still_shows_nothing(tmp_path):
+    """Every component of repeated fixes of one place never changes, and each has an error."""
+    est, truth = planar(tmp_path, (1.0, 1.0, 1.0))
+    moved(est, truth, lambda t, own, true: (own[:1] + 0.1 * UP, true[:1]))
+    assert len(cs.read(est, truth=truth).axes) > 3
+
+
 def test_only_a_constant_that_is_never_wrong_is_left_out(rng):
     error, variance = rng.normal(size=(2, 6, 4)), np.ones((2, 6, 4))
     error[:, :, 1:3] = 0.0
@@ -143,17 +234,20 @@ def test_only_a_constant_that_is_never_wrong_is_left_out(rng):
     assert not not_estimated([*(0.0 * error)], [*np.ones((2, 6, 4))]).any()  # a file beside itself
 
 
-@pytest.mark.parametrize("variances, said", [
-    ((0, 0, 0, 0.0025), "--axes x,y,yaw for a trajectory"),
-    ((1e6, 0, 0, 0.0025), "--axes x,y,yaw for a trajectory"),
+@pytest.mark.parametrize("variances, remedy", [
+    ((0, 0, 0, 0.0025), ""), ((1e6, 0, 0, 0.0025), ""), ((0.0025, 0, 0, 0), "in the row of its own component"),
 ])  # fmt: skip
-def test_a_variance_in_the_wrong_row(variances, said, tmp_path):
+def test_a_variance_in_the_wrong_row(variances, remedy, tmp_path):
+    """A zero of what never changes is a dummy; one of a heading that changes is not."""
     est, truth = planar(tmp_path, (1, 1, 1))
     for path in est.iterdir():
         rows = np.loadtxt(path)
         rows[:, 8:] = np.diag([0.01, 0.01, *variances]).ravel()
         np.savetxt(path, rows)
-    with pytest.raises(cs.InputError, match=said):
+    if not remedy:
+        assert cs.read(est, truth=truth).axes == ("x", "y", "yaw")
+        return
+    with pytest.raises(cs.InputError, match=remedy):
         cs.read(est, truth=truth)
 
 

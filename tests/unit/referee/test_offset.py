@@ -1,7 +1,6 @@
 """Clocks that differ, on runs whose offset is known."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -13,7 +12,15 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clock_offset
-from consistency.referee.readers.clock_offset import Offset, clock_shift, offset_of, shows_in_estimates, steps_of
+from consistency.referee.readers.clock_offset import (
+    Offset,
+    Sample,
+    clock_shift,
+    offset_of,
+    samples_of,
+    shows_in_estimates,
+    steps_of,
+)
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 
@@ -73,6 +80,11 @@ def kalman_runs(rng, count, offset=0.0):
     ]
 
 
+def sizes(at):
+    """In place of the sizes of the errors of a sample: those of a function of the shift."""
+    return lambda sample, shift: np.full(len(sample.factors), at(shift))
+
+
 @pytest.fixture
 def rng():
     return np.random.default_rng()
@@ -80,13 +92,13 @@ def rng():
 
 @pytest.mark.parametrize("offset", [-0.35, -0.012, 0.0, 0.04, 0.7])
 def test_without_noise_it_is_found_to_the_millisecond(rng, offset):
-    found = offset_of([run_of(rng, offset, noise=1e-3) for _ in range(5)])
+    found = offset_of(samples_of([run_of(rng, offset, noise=1e-3) for _ in range(5)]))
     assert found.value == pytest.approx(offset, abs=5e-4)
     assert found.low <= found.value <= found.high
 
 
 def test_a_step_goes_to_the_offset(rng):
-    steps = steps_of(run_of(rng, 0.02, noise=1e-3), 0.0, 3)
+    steps = steps_of(*samples_of([run_of(rng, 0.02, noise=1e-3)]), 0.0, 3)
     assert_allclose(steps, 0.02, atol=2e-3)
 
 
@@ -94,7 +106,7 @@ def test_the_interval_by_hand(rng, monkeypatch):
     """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
     steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array([next(steps)]))
-    found = offset_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)])
+    found = offset_of(samples_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)]))
     reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
     assert found.high - found.value == pytest.approx(reach, rel=1e-6)
     assert found.value - found.low == pytest.approx(reach, rel=1e-6)
@@ -115,38 +127,38 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alo
         return np.array([0.001, -0.001, np.nan, 0.0])
 
     slope = (nees - then) / 0.04**2
-    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: then + slope * (shift - 0.04) ** 2)
+    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: then + slope * (shift - 0.04) ** 2))
     monkeypatch.setattr(clock_offset, "steps_of", steps)
-    found = offset_of([run_of(rng, 0.0)])
+    found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert asked == [12]
     assert found.alone is alone
     assert found.value == pytest.approx(0.04, abs=1e-4)
     assert found.explained == pytest.approx(1.0 - then / nees, abs=1e-4)
     asked.clear()
-    several = offset_of([run_of(rng, 0.0)] * 2)
+    several = offset_of(samples_of([run_of(rng, 0.0)] * 2))
     assert not several.alone
     assert asked == [1, 1]
 
 
 @pytest.mark.parametrize("steps, p", [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
 def test_steps_that_agree_are_certain_and_two_are_none(steps, p, rng, monkeypatch):
-    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + (shift - 0.04) ** 2)
+    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + (shift - 0.04) ** 2))
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array(steps))
-    found = offset_of([run_of(rng, 0.0)])
+    found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (None if found is None else found.p_value) == p
 
 
 def test_steps_that_agree_on_no_offset_find_none(rng, monkeypatch):
-    monkeypatch.setattr(clock_offset, "_size", lambda _, shift, __: 1.0 + abs(shift))
+    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + abs(shift)))
     monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.zeros(4))
-    found = offset_of([run_of(rng, 0.0)])
+    found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (found.value, found.p_value) == (0.0, 1.0)
 
 
 def test_with_noise_it_is_named(rng):
     """40 ms at 5 m/s are 0.2 m beside a sigma of 0.3 m. The estimate spreads by 1.2 ms: 10 times that is never seen."""
     runs = [run_of(rng, 0.04) for _ in range(20)]
-    found = offset_of(runs)
+    found = offset_of(samples_of(runs))
     assert found.found
     assert found.value == pytest.approx(0.04, abs=0.012)
     shift, notes = clock_shift("est", runs, None)
@@ -169,7 +181,7 @@ def test_a_right_filters_errors_that_go_with_the_true_velocity_are_not_laid_on_t
     Of three none is found with 1e-6, and more than one told with 3e-6.
     """
     logs = [kalman_runs(rng, 60) for _ in range(3)]
-    assert any(offset_of(runs).found for runs in logs)
+    assert any(offset_of(samples_of(runs)).found for runs in logs)
     assert sum(bool(clock_shift("est", runs, None)[1]) for runs in logs) <= 1
 
 
@@ -178,24 +190,24 @@ def test_clocks_of_a_right_filter_that_differ_are_named(rng, offset):
     """40 runs find it to 0.006 s: 0.05 is eight times that."""
     runs = kalman_runs(rng, 40, offset)
     assert "seem to differ by" in clock_shift("est", runs, None)[1][0]
-    assert offset_of(runs).value == pytest.approx(offset, abs=0.05)
+    assert offset_of(samples_of(runs)).value == pytest.approx(offset, abs=0.05)
 
 
 def test_estimates_show_an_offset_of_its_own_sign(rng):
     runs = [run_of(rng, 0.04, noise=1e-3) for _ in range(4)]
-    assert shows_in_estimates(runs, 0.04)
-    assert not shows_in_estimates(runs, -0.04)
-    assert shows_in_estimates([run_of(rng, -0.04, noise=1e-3)], -0.04)
+    assert shows_in_estimates(samples_of(runs), 0.04)
+    assert not shows_in_estimates(samples_of(runs), -0.04)
+    assert shows_in_estimates(samples_of([run_of(rng, -0.04, noise=1e-3)]), -0.04)
     still = [replace(run, estimate=np.zeros_like(run.estimate)) for run in runs]
-    assert not shows_in_estimates(still, 0.04)
+    assert not shows_in_estimates(samples_of(still), 0.04)
 
 
 def test_the_error_of_a_row_is_not_in_the_motion_that_it_is_compared_with(rng, monkeypatch):
     """Errors of single fixes go with the motion of the estimates to their own row, by 40 standard errors."""
     monkeypatch.setattr(clock_offset, "SHOWN", 1e-7)
     runs = [run_of(rng, 0.0) for _ in range(30)]
-    assert not shows_in_estimates(runs, 0.01)
-    assert not shows_in_estimates(runs, -0.01)
+    assert not shows_in_estimates(samples_of(runs), 0.01)
+    assert not shows_in_estimates(samples_of(runs), -0.01)
 
 
 def test_what_estimates_show_by_hand(rng, monkeypatch):
@@ -204,12 +216,11 @@ def test_what_estimates_show_by_hand(rng, monkeypatch):
     The standard error is then the root of 2 / 3 * (0.05^2 + 0.05^2), 1 / (10 sqrt 3).
     That is t = -6.93, with the probability 0.0101 with 2 degrees of freedom.
     """
-    monkeypatch.setattr(clock_offset, "_estimate_sums", lambda poses, parts: np.array([[poses, 10.0]]))
-    runs = [SimpleNamespace(sound=lambda top=top: top) for top in (3.0, 5.0, 4.0)]
+    monkeypatch.setattr(clock_offset, "_estimate_sums", lambda top, parts: np.array([[top, 10.0]]))
     for rate, shown in ((0.0102, True), (0.0100, False)):
         monkeypatch.setattr(clock_offset, "SHOWN", rate)
-        assert shows_in_estimates(runs, -0.4) is shown
-        assert not shows_in_estimates(runs, 0.4)
+        assert shows_in_estimates([3.0, 5.0, 4.0], -0.4) is shown
+        assert not shows_in_estimates([3.0, 5.0, 4.0], 0.4)
 
 
 def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng):
@@ -222,9 +233,59 @@ def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng):
 def test_where_nothing_moves_there_is_none(rng):
     runs = [run_of(rng, 0.0) for _ in range(4)]
     still = [replace(run, truth=np.zeros_like(run.truth), estimate=0.1 * SIGMA * run.estimate) for run in runs]
-    assert offset_of(still) is None
+    assert offset_of(samples_of(still)) is None
     with pytest.raises(cs.InputError, match="--time-offset estimate: nothing moves in est"):
         clock_shift("est", still, "estimate")
+
+
+def with_covariance(run, scale):
+    return replace(run, covariance=run.covariance * scale)
+
+
+@pytest.mark.parametrize("offset", [0.35, -0.28, 0.6])
+def test_an_offset_is_found_beside_a_covariance_that_is_far_too_small(rng, offset):
+    """By 1e4: every estimate is beyond 100 times its NEES, at the right offset, too. With noise it spreads by 2 ms."""
+    runs = [with_covariance(run_of(rng, offset), 1e-4) for _ in range(8)]
+    assert clock_shift("est", runs, "estimate")[0] == pytest.approx(offset, abs=0.02)
+    assert "--time-offset" in clock_shift("est", runs, None)[1][0]
+
+
+def test_broken_estimates_decide_nothing(rng):
+    """A tenth of the rows, off by 1e4 sigma along x alone."""
+    runs = [run_of(rng, 0.04) for _ in range(20)]
+    for run in runs:
+        run.estimate[::10, 0] += 1e4 * SIGMA[0]
+    assert offset_of(samples_of(runs)).value == pytest.approx(0.04, abs=0.02)
+
+
+def test_components_that_are_not_judged_say_nothing(rng):
+    runs = [run_of(rng, 0.1) for _ in range(8)]
+    for run in runs:
+        run.estimate[:, 1] += 1e3 * rng.normal(size=100)
+    assert offset_of(samples_of(runs, [0, 2])).value == pytest.approx(0.1, abs=0.03)
+    assert samples_of(runs, [0, 2])[0].axes == [0, 2]
+
+
+def test_a_component_that_never_changes_in_the_estimates_says_nothing(rng):
+    """A heading of 0 throughout, with errors of many sigma."""
+    runs = [run_of(rng, 0.1) for _ in range(8)]
+    still = [replace(run, estimate=run.estimate * [1.0, 1.0, 0.0]) for run in runs]
+    [first, *_] = samples_of(still)
+    assert first.axes == [0, 1]
+    P, e = runs[0].covariance[:, :2, :2], still[0].errors(0.0)[:, :2]
+    nees = np.einsum("ki,kij,kj->k", e, np.linalg.inv(P), e)
+    assert_allclose(first.squares(0.0), nees / 2.0)
+    assert samples_of(still, [2])[0].axes == [2]  # nothing else is judged
+
+
+def test_of_many_runs_some_are_looked_at(rng):
+    runs = [replace(run_of(rng, 0.04), run=number) for number in range(3)]
+    many = [replace(runs[k % 3], run=k) for k in range(200)]
+    numbers = [sample.poses.run for sample in samples_of(many)]
+    assert len(numbers) == clock_offset.RUNS == 60
+    assert numbers == sorted(set(numbers))
+    assert (numbers[0], numbers[-1]) == (0, 199)
+    assert len(samples_of(many[:60])) == 60
 
 
 # --- files ------------------------------------------------------------------------------------------
@@ -277,20 +338,16 @@ def test_trajectories_are_read_with_an_offset(tmp_path, rng):
     assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
 
 
-def test_what_has_truth_is_judged_at_every_offset(rng, monkeypatch):
-    """Also where a shift leaves it without truth: an offset explains nothing by leaving estimates out."""
-    asked = []
+def test_what_has_truth_is_judged_at_every_offset(rng):
+    """Also where a shift leaves it without truth: an offset explains nothing by leaving estimates out.
 
-    def size(_, shift, judged):
-        asked.append(bool(judged.all()))
-        return 1.0 + (shift - 0.04) ** 2
-
-    monkeypatch.setattr(clock_offset, "_size", size)
-    run = run_of(rng, 0.0)
-    within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)  # any shift leaves some without truth
-    offset_of([replace(run, true_t=run.true_t[within], truth=run.truth[within])])
-    assert len(asked) > 20
-    assert all(asked)
+    In a truth that ends with the estimates, wrong by 3 sigma in its last second alone, an offset of a second would.
+    """
+    run = run_of(rng, 0.0, noise=1e-3)
+    within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)
+    truth = run.truth[within] + 3.0 * SIGMA * (run.true_t[within] > 8.9)[:, None]
+    found = offset_of(samples_of([replace(run, true_t=run.true_t[within], truth=truth)]))
+    assert abs(found.value) < 0.5
 
 
 @pytest.mark.parametrize("explained, alone, found", [(0.02, False, True), (0.004, False, False), (0.02, True, False)])

@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
+from consistency.referee.readers.formats.file_head import head_of
+from consistency.referee.readers.formats.sheet import sheet_of
 from consistency.referee.readers.formats.spellings import renamed
 from consistency.referee.readers.places import one_of_each_kind
 
@@ -252,6 +254,31 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
             cs.read(tmp_path / "est" / "0.csv", own, columns=names)
 
 
+@pytest.mark.parametrize("suffix", ["csv", "txt"])
+def test_one_column_states_two_deviations(tmp_path, suffix):
+    """As the accuracy eph of vehicle_local_position, which is of x and of y."""
+    rng = np.random.default_rng()
+    t, sigma = 1e6 + 20_000.0 * np.arange(50), rng.uniform(0.1, 0.3, 50)
+    true = rng.normal(size=(50, 2))
+    own = true - sigma[:, None] * rng.normal(size=(50, 2))
+    mark = "," if suffix == "csv" else " "
+    for name, place in (("est", own), ("true", true)):
+        rows = np.column_stack([t, place, sigma])
+        names = mark.join(("timestamp_us", "x", "y", "eph"))
+        np.savetxt(tmp_path / f"{name}.{suffix}", rows, delimiter=mark, header=names, comments="# " * (suffix == "txt"))
+    given = {"sigma_x": "eph", "sigma_y": "eph"}
+    files = tmp_path / f"est.{suffix}", tmp_path / f"true.{suffix}"
+    if suffix == "txt":
+        sheet = sheet_of(files[0], head_of(files[0], given), given)
+        assert_allclose(sheet.data["sigma_x"], sigma)
+        assert_allclose(sheet.data["sigma_y"], sigma)
+        assert set(sheet.data) == {"timestamp_us", "x", "y", "sigma_x", "sigma_y"}
+        return
+    record = cs.read(*files, state=["x", "y"], columns=given)
+    assert_allclose(record.covariance[0], sigma[:, None, None] ** 2 * np.eye(2), rtol=1e-6)
+    assert_allclose(record.error[0], true - own, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "names, columns, expected",
     [
@@ -263,10 +290,13 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
         (["boot_us"], {"t_ms": "boot_us"}, ["t_ms"]),
         (["c_0", "c_1", "c"], {"cov_*": "c_*"}, ["cov_0", "cov_1", "c"]),
         (["Pos N"], {"x": "pos_n"}, ["x"]),
+        (["eph", "x"], {"sigma_x": "eph", "sigma_y": "eph"}, ["sigma_x", "x", "sigma_y"]),
+        (["c_x", "b"], {"P_*": "c_*", "x": "b", "s_*": "c_*"}, ["P_x", "x", "s_x"]),
+        (["e"], {"a": "e", "b": "e", "c": "e"}, ["a", "b", "c"]),
     ],
 )
 def test_names_in_place_of_others(names, columns, expected):
-    assert renamed(names, columns, Path("a.csv")) == expected
+    assert [each.name for each in renamed(names, columns, Path("a.csv"))] == expected
 
 
 @pytest.mark.parametrize(

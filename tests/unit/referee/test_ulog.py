@@ -9,7 +9,9 @@ import pytest
 from command import consistency
 from numpy.testing import assert_allclose
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
+import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 
@@ -206,6 +208,189 @@ def test_the_older_message_holds_innovations_and_variances(tmp_path):
     assert np.isnan(height.nis[1::2]).all()
     with pytest.raises(InputError, match=r"more than one sensor \(vel, hpos, vpos, mag, heading, …\)"):
         read_innovations(path)
+
+
+# --- what is fused -------------------------------------------------------------------------------------
+
+
+def flag(log, stamp, instance=0, late=100, **flags):
+    """The flags of the EKF2 as they are after the data of ``stamp``, us, published ``late`` us later."""
+    stamps = {"timestamp": ("Q", stamp + late), "timestamp_sample": ("Q", stamp)}
+    fields = {name: ("B", value) for name, value in flags.items()}
+    log.other("estimator_status_flags", stamps | fields, instance)
+
+
+@pytest.mark.parametrize(
+    "sensor, size, flags",
+    [
+        ("gps_hpos", 2, {"cs_gps": 1}),
+        ("gps_hpos", 2, {"cs_gnss_pos": 1}),
+        ("gps_vpos", 1, {"cs_gps_hgt": 1}),
+        ("baro_vpos", 1, {"cs_baro_hgt": 1}),
+        ("mag_field", 3, {"cs_mag_3d": 1, "cs_mag": 0}),
+        ("mag_field", 3, {"cs_mag_3d": 0, "cs_mag": 1}),
+    ],
+)
+def test_what_is_not_fused_by_its_flag_does_not_count(tmp_path, sensor, size, flags):
+    """The flags are logged as they change; between two messages those before hold, before the first one the first."""
+    own, variance = draws(steps=20, n=size)
+    own[:5] = -1e6
+    log = flight(own, variance, sensor)
+    none = dict.fromkeys(flags, 0)
+    for k, values in ((2, none), (5, flags), (12, none), (17, flags)):
+        flag(log, 10**7 + k * STEP, **values)
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    idle = np.isin(np.arange(20), [0, 1, 2, 3, 4, 12, 13, 14, 15, 16])
+    assert (found.dof == np.where(idle, 0, size)).all()
+    assert_allclose(found.nis[~idle], (own**2 / variance).sum(axis=1)[~idle], rtol=1e-5)
+    assert f"10 messages do not count, as the EKF2 did not fuse the sensor ({', '.join(flags)} 0)" in found.notes[-1]
+
+
+def test_flags_of_others_change_nothing(tmp_path):
+    own, variance = draws(steps=6)
+    log = flight(own, variance)
+    flag(log, 10**7, cs_opt_flow=0, cs_gps_hgt=0)
+    flag(log, 10**7, instance=1, cs_opt_flow=0, cs_gps_hgt=0)
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    assert (found.dof == 2).all()
+    assert len(found.notes) == 1
+
+
+def test_flags_are_those_of_the_same_instance(tmp_path):
+    own, variance = draws(steps=6)
+    log = Flight()
+    for k in range(6):
+        for instance in (0, 1):
+            log.both(10**7 + k * STEP, {"gps_hpos": (own[k], variance[k])}, instance)
+    flag(log, 10**7, instance=1, cs_gps=1)
+    flag(log, 10**7, instance=0, cs_gps=0)
+    path = log.write(tmp_path / "a.ulg")
+    assert (read_innovations(path, run=1).dof == 2).all()
+    with pytest.raises(InputError, match=r"a\.ulg: holds no innovation with a variance; nothing was fused"):
+        read_innovations(path, run=0)
+
+
+def test_a_sensor_that_no_flag_ever_fuses_is_refused(tmp_path):
+    log = Flight()
+    for k in range(6):
+        log.both(10**7 + k * STEP, {"gps_hpos": ((1.0, k), (1.0, 1.0)), "baro_vpos": (k, 1.0)})
+    flag(log, 10**7, cs_gps=0, cs_baro_hgt=1)
+    with pytest.raises(InputError, match=r"--filter gps_hpos: is never fused in .*; there are: baro_vpos"):
+        read_innovations(log.write(tmp_path / "a.ulg"), "gps_hpos")
+    assert read_innovations(tmp_path / "a.ulg").name == "baro_vpos"
+
+
+@pytest.mark.parametrize("bit, sensor", [(2, "gps_hpos"), (11, "gps_vpos"), (9, "baro_vpos"), (5, "mag_field")])
+def test_bits_of_the_status_stand_for_flags(tmp_path, bit, sensor):
+    log = Flight(sample=False)
+    for k in range(8):
+        log.both(10**7 + k * STEP, {sensor: (1.0 + k, 4.0)})
+        mode = 1 << bit if k >= 3 else 0xFFFFFFFF ^ (1 << bit)
+        log.other("estimator_status", {"timestamp": ("Q", 10**7 + k * STEP + 40), "control_mode_flags": ("I", mode)})
+    found = read_innovations(log.write(tmp_path / "a.ulg"), sensor)
+    assert (np.isnan(found.nis) == (np.arange(8) < 3)).all()
+    assert "3 messages do not count" in found.notes[-1]
+
+
+@pytest.mark.parametrize("clock", [0, 7])
+def test_one_message_needs_no_partner_though_its_clock_stands_still(tmp_path, clock):
+    """As in the sample log of pyulog, whose 682 messages were one."""
+    own, variance = draws(steps=300, n=1)
+    log = Flight()
+    for y, S in zip(own[:, 0], variance[:, 0], strict=True):
+        fields = {"timestamp": ("Q", clock), "hagl_innov": ("f", y), "hagl_innov_var": ("f", S)}
+        log.other("ekf2_innovations", fields)
+    log.other("estimator_status", {"timestamp": ("Q", 5), "control_mode_flags": ("I", 0)})
+    found = read_innovations(log.write(tmp_path / "a.ulg"))
+    assert_allclose(found.nis, own[:, 0] ** 2 / variance[:, 0], rtol=1e-5)
+    assert np.isnan(found.t).all()
+    assert not any("partner" in note for note in found.notes)
+    assert watch(found, make_monitor("optimal", false_alarm=1e-5)).alarm is None
+
+
+def test_two_topics_whose_clock_stands_still_have_no_partners(tmp_path):
+    log = Flight()
+    for k in range(5):
+        log.both(0, {"gps_hpos": ((1.0, k), (1.0, 1.0))})
+    with pytest.raises(InputError, match=r"a\.ulg: the timestamps of estimator_innovations are all 0 s"):
+        read_innovations(log.write(tmp_path / "a.ulg"))
+
+
+# --- flights of a simulation ----------------------------------------------------------------------------
+
+SIGMA = np.array([0.5, 0.4, 0.8, 0.02, 0.02, 0.05])  # north, east, down; rotation about them
+
+
+def simulated(path, states=25, rows=120, origin=None, true_origin=None):
+    """A circling flight with its truth and the variances of the EKF2; the errors (rows, 6)."""
+    rng = np.random.default_rng()
+    t = 0.1 * np.arange(rows)
+    place = np.column_stack([5.0 * np.sin(t), 5.0 * np.cos(t), -10.0 - t])
+    turn = Rotation.from_euler("ZYX", np.column_stack([t, 0.05 * np.sin(t), 0.1 * np.cos(t)]))
+    e = SIGMA * rng.normal(size=(rows, 6))
+    own = Rotation.from_rotvec(-e[:, 3:]) * turn
+    log = Flight()
+    for k in range(rows):
+        stamp = 10**7 + 100_000 * k
+        poses = (("", place[k] - e[k, :3], own[k], origin), ("_groundtruth", place[k], turn[k], true_origin))
+        for ending, p, R, ref in poses:
+            x, y, z, w = R.as_quat()
+            fields = {"timestamp": ("Q", stamp), "q": ("4f", (w, x, y, z))}
+            log.other(f"vehicle_attitude{ending}", fields)
+            fields = {"timestamp": ("Q", stamp), "xy_valid": ("B", int(k > 3 or ending != "")), "z_valid": ("B", 1)}
+            fields |= dict(zip("xyz", (("f", each) for each in p), strict=True))
+            if ref is not None:
+                kinds = {"ref_lat": "d", "ref_lon": "d", "ref_alt": "f"}
+                fields |= {name: (kind, each) for (name, kind), each in zip(kinds.items(), ref, strict=True)}
+            log.other(f"vehicle_local_position{ending}", fields)
+        if k % 10 == 0:
+            variances = np.zeros(24)
+            first = 6 if states == 25 else 7
+            variances[first : first + 3] = SIGMA[:3] ** 2
+            variances[:3] = SIGMA[3:] ** 2
+            if states == 24:  # to first order, d q = (0, rotation vector) q / 2
+                x, y, z, w = own[k].as_quat()
+                G = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
+                variances[:4] = np.diag(G @ np.diag(SIGMA[3:] ** 2) @ G.T)
+            values = {"states": (f"{states}f", np.zeros(states)), "covariances": ("24f", variances)}
+            log.other("estimator_states", {"timestamp": ("Q", stamp)} | values)
+    log.write(path)
+    return e[4:]
+
+
+@pytest.mark.parametrize("states", [24, 25])
+def test_a_flight_of_a_simulation_is_judged(tmp_path, states):
+    path = tmp_path / "sitl.ulg"
+    errors = simulated(path, states)
+    record = cs.read(path)
+    assert record.axes == ("x", "y", "z", "roll", "pitch", "yaw")
+    assert_allclose(record.error[0], errors, atol=1e-5)  # numbers of four bytes
+    known = record.covariance[0, 2:]  # the first message comes before the first valid position
+    assert_allclose(known, np.broadcast_to(np.diag(SIGMA**2), known.shape), rtol=1e-4)
+    assert len(record.parts) == 6
+    assert_allclose(record.t[:2], [10.4, 10.5])
+    assert any("variances of estimator_states" in note for note in record.notes)
+
+
+def test_origins_of_estimates_and_truth_may_differ(tmp_path):
+    """A hundred-thousandth of a degree is 1.11 m to the north, and at 60 degrees 0.558 m to the east."""
+    path = tmp_path / "sitl.ulg"
+    errors = simulated(path, origin=(60.0, 10.0, 100.0), true_origin=(60.00001, 10.00001, 103.0))
+    off = cs.read(path).error[0, :, :3] - errors[:, :3]
+    assert_allclose(off, np.broadcast_to([1.114, 0.558, -3.0], off.shape), atol=2e-3)
+
+
+def test_what_a_flight_lacks_is_named(tmp_path):
+    path = tmp_path / "a.ulg"
+    flight(*draws(steps=3)).write(path)
+    missing = r"a\.ulg: holds no message 'vehicle_local_position'; .*'consistency monitor'"
+    with pytest.raises(InputError, match=missing):
+        cs.read(path)
+    with pytest.raises(InputError, match=r"a\.ulg: unknown kind of file; .*consistency monitor"):
+        cs.read(path, truth=path)
+    for option in ({"state": ["x"]}, {"topic": "/a"}):
+        with pytest.raises(InputError, match=rf"--{next(iter(option))}: does not go with .*a\.ulg"):
+            cs.read(path, **option)
 
 
 def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):

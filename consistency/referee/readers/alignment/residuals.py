@@ -97,7 +97,7 @@ def clocks_and_frames(
         before = shift
         later = [p.later(shift) for p in runs]
         frames = frames_of(name, later, align, judged)
-        shift, notes = clock_shift(name, _moved(runs, frames), time_offset)
+        shift, notes = clock_shift(name, _moved(runs, frames), time_offset, judged)
         if abs(shift - before) <= SETTLED:
             break
     later = [p.later(shift) for p in runs]

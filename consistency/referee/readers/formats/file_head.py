@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import zlib
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +24,7 @@ class Head(NamedTuple):
     line: int  # of the names, from 1
     comment: bool  # it begins with #
     spaced: bool  # by white space
+    places: Sequence[int]  # of these columns in the file
 
 
 def head_of(path: Path, columns: Columns | None = None) -> Head | None:
@@ -47,7 +49,8 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
     if len(names) != width:
         return None
     is_spaced = not any(mark in line for mark in ",;\t")
-    return Head(renamed(names, columns, path), number, comment, is_spaced)
+    known, places = zip(*renamed(names, columns, path), strict=True)
+    return Head(list(known), number, comment, is_spaced, places)
 
 
 def begins_with_numbers(path: Path) -> bool:

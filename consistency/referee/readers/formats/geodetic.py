@@ -173,7 +173,8 @@ def read_solution(path: Path) -> Fixes:
     read_as = f"read as a solution of RTKLIB, {len(names) + 1} columns, {_clock_note(solution.clock, t)}"
     note = f"{path}: {read_as}; {_qualities(columns)}"
     values = np.column_stack([t, place, P.reshape(-1, 9)])
-    lines = Fixes(path, values, found.line, note, cut=found.cut, geodetic=kind is not BASELINE)
+    named = {name.partition("(")[0]: columns[name] for name in solution.names if name not in kind}
+    lines = Fixes(path, values, found.line, note, cut=found.cut, columns=named, geodetic=kind is not BASELINE)
     increasing(lines)
     return lines
 

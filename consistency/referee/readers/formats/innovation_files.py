@@ -225,7 +225,7 @@ MICRO = 1e-6  # s in the unit of timestamps
 class Pairs:
     """Innovations and their variances as the log has them together, N messages."""
 
-    t: Array  # (N,), s, increasing
+    t: Array  # (N,), s, not decreasing; NaN of a clock that stands still
     innovation: Mapping[str, Array]  # (N,) for each component, as "gps_hpos[0]" or "baro_vpos"
     variance: Mapping[str, Array]
     alone: int = 0  # messages of one topic without their partner in the other

@@ -123,7 +123,9 @@ def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Colu
     pose = numbers(found.position + found.quaternion)
     values = np.column_stack([t, *pose, *stated])
     note = _named_note(path, head, found, true, UNIT_NAMES[unit])
-    lines = Lines(path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut)
+    lines = Lines(
+        path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut, columns=sheet.data
+    )
     return increasing(lines)
 
 

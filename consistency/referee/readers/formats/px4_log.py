@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,30 @@ from consistency.referee.readers.formats.innovation_files import (
     numbered_log,
     require_in_order,
 )
+from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 
 INNOVATIONS, VARIANCES = TOPICS = ("estimator_innovations", "estimator_innovation_variances")
+FLAGS = "estimator_status_flags"  # which sensors the EKF2 fuses
+STATUS = "estimator_status"  # of firmware without these: their bits are in its field ...
+MODE = "control_mode_flags"
+BITS = {
+    "cs_gps": 2, "cs_opt_flow": 3, "cs_mag_hdg": 4, "cs_mag_3d": 5, "cs_baro_hgt": 9, "cs_rng_hgt": 10,
+    "cs_gps_hgt": 11, "cs_ev_pos": 12, "cs_ev_yaw": 13, "cs_ev_hgt": 14, "cs_fuse_beta": 15, "cs_fuse_aspd": 19,
+    "cs_gps_yaw": 22, "cs_ev_vel": 24, "cs_gravity_vector": 34, "cs_mag": 35, "cs_gnss_vel": 44,
+}  # fmt: skip
+GPS_VELOCITY = ("cs_gps", "cs_gnss_vel")
+HEIGHTS = ("cs_baro_hgt", "cs_rng_hgt", "cs_gps_hgt", "cs_ev_hgt")
+YAWS = ("cs_mag_hdg", "cs_gps_yaw", "cs_gnss_yaw", "cs_ev_yaw")
+FUSED_BY = {
+    "gps_hvel": GPS_VELOCITY, "gps_vvel": GPS_VELOCITY, "gps_hpos": ("cs_gps", "cs_gnss_pos"),
+    "gps_vpos": ("cs_gps_hgt",), "ev_hvel": ("cs_ev_vel",), "ev_vvel": ("cs_ev_vel",), "ev_hpos": ("cs_ev_pos",),
+    "ev_vpos": ("cs_ev_hgt",), "baro_vpos": ("cs_baro_hgt",), "rng_vpos": ("cs_rng_hgt",), "flow": ("cs_opt_flow",),
+    "heading": YAWS, "mag_field": ("cs_mag_3d", "cs_mag"), "mag": ("cs_mag_3d",), "airspeed": ("cs_fuse_aspd",),
+    "beta": ("cs_fuse_beta",), "gravity": ("cs_gravity_vector",), "vel": ("cs_gps", "cs_ev_vel"),
+    "hpos": ("cs_gps", "cs_ev_pos"), "vpos": HEIGHTS,
+}  # flags by sensor, one of which is set while it is fused  # fmt: skip
 OLD = "ekf2_innovations"  # of older firmware: innovations and variances in one message
 OLD_FIELD = re.compile(r"(.+)(_innov|_innov_var)(\[\d+\])?")
 SPLIT = ("vel[0]", "vel[1]", "vel[2]", "hpos[0]", "hpos[1]", "vpos")  # its vel_pos_innov, fused at different times
@@ -44,7 +66,8 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     taken as independent. ``gps_hpos[0]`` in place of ``gps_hpos`` selects one component.
 
     A message that repeats the innovations before it is a step without a measurement: the EKF2 publishes what it fused
-    last. So is one without an innovation (NaN), or with a variance of zero, as for a sensor that is not fused.
+    last. So is one without an innovation (NaN), or with a variance of zero, as for a sensor that is not fused, and one
+    at a time at which the flags of the EKF2 say so, as before the first fix of GPS.
 
     Parameters
     ----------
@@ -59,9 +82,12 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
     Source: docs.px4.io, "ULog File Format" and "EstimatorInnovations (UORB message)"; the older message of PX4,
     ekf2_innovations.msg, whose first six are of velocity and position, north, east, down: ``vel``, ``hpos``, ``vpos``.
     """
-    log = _loaded(path)
-    pairs = _paired(path, *_topics(path, log, instance))
+    log = loaded(path, [*TOPICS, OLD, FLAGS, STATUS])
+    innovations, variances, flags = _topics(path, log, instance)
+    pairs = _paired(path, innovations, variances)
     pairs.require_variances(path, VARIANCES, ", field '{field}' at {t}: {value} is below 0")
+    logged = pairs
+    pairs = _fused(logged, flags, _clock(path, innovations, flags))
     groups: dict[str, list[str]] = {}
     for field in pairs.innovation:
         groups.setdefault(COMPONENT.sub("", field), []).append(field)
@@ -76,10 +102,15 @@ def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None
         sensor = str(choose(path, "filter", list(sensors), sensor, "sensor"))
     parts = sensors[sensor]
     nis, dof, held = pairs.nis(parts)
-    return numbered_log(sensor, pairs.t, nis, dof, _notes(path, sensor, pairs, dof, held, log))
+    notes = _notes(path, sensor, pairs, dof, held, log)
+    if idle := int((logged.of(parts)[2] & ~pairs.of(parts)[2]).any(axis=1).sum()):
+        what = f"the EKF2 did not fuse the sensor ({listed(_flags_of(parts[0], flags))} 0)"
+        notes.append(f"{path}: {plural(idle, 'message')} do not count, as {what}")
+    return numbered_log(sensor, pairs.t, nis, dof, notes)
 
 
-def _loaded(path: Path) -> Any:
+def loaded(path: Path, topics: Sequence[str]) -> Any:
+    """The messages of some topics of a log; raises InputError where it cannot be read."""
     try:
         from pyulog import ULog
     except ImportError:
@@ -88,12 +119,12 @@ def _loaded(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     refusal = "cannot be read as a ULog, damaged or cut short"
     with reading(path, refusal), path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-        return ULog(file, [*TOPICS, OLD])  # prints what it skips
+        return ULog(file, list(topics))  # prints what it skips
 
 
-def _topics(path: Path, log: Any, instance: int | None) -> tuple[Fields, Fields]:
-    """Innovations and variances of one instance of the EKF2."""
-    found: dict[str, dict[int, Fields]] = {INNOVATIONS: {}, VARIANCES: {}, OLD: {}}
+def _topics(path: Path, log: Any, instance: int | None) -> tuple[Fields, Fields, Fields]:
+    """Innovations and variances of one instance of the EKF2, and its flags with their times, if they are logged."""
+    found: dict[str, dict[int, Fields]] = {INNOVATIONS: {}, VARIANCES: {}, OLD: {}, FLAGS: {}, STATUS: {}}
     for each in log.data_list:
         found[each.name][each.multi_id] = each.data
     if not found[INNOVATIONS] and not found[VARIANCES]:
@@ -107,7 +138,31 @@ def _topics(path: Path, log: Any, instance: int | None) -> tuple[Fields, Fields]
     if not there:
         raise InputError(f"{path}: no instance of the EKF2 has both {' and '.join(TOPICS)}")
     own = choose(path, "run", there, instance, "instance of the EKF2")
-    return found[INNOVATIONS][own], found[VARIANCES][own]
+    flags: Fields = {}
+    for of_instances in (found[STATUS], found[FLAGS]):
+        flags = of_instances.get(own, flags)
+    if MODE in flags:
+        bits = flags[MODE].astype(np.int64)
+        flags = flags | {name: bits >> bit & 1 for name, bit in BITS.items()}
+    return found[INNOVATIONS][own], found[VARIANCES][own], flags
+
+
+def _flags_of(field: str, flags: Fields) -> list[str]:
+    """Flags that are there, one of which is set while the sensor of a field is fused."""
+    return [name for name in FUSED_BY.get(COMPONENT.sub("", field), ()) if name in flags]
+
+
+def _fused(pairs: Pairs, flags: Fields, clock: str) -> Pairs:
+    """Pairs without the variances of sensors that are not fused by their flags, of which the last ones before count."""
+    if not flags or np.isnan(pairs.t).any():
+        return pairs
+    last = np.searchsorted(flags[clock].astype(float) * MICRO, pairs.t, side="right") - 1
+    variance = dict(pairs.variance)
+    for field, values in pairs.variance.items():
+        if names := _flags_of(field, flags):
+            is_fused = np.any([flags[name][np.maximum(last, 0)] != 0 for name in names], axis=0)
+            variance[field] = np.where(is_fused, values, np.nan)
+    return replace(pairs, variance=variance)
 
 
 def _divided(data: Fields) -> tuple[Fields, Fields]:
@@ -125,13 +180,24 @@ def _divided(data: Fields) -> tuple[Fields, Fields]:
     return parts["_innov"], parts["_innov_var"]
 
 
-def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
-    clock = next((name for name in CLOCKS if name in innovations and name in variances), None)
+def _clock(path: Path, *topics: Fields) -> str:
+    """The clock that the messages of some topics have in common."""
+    clock = next((name for name in CLOCKS if all(name in topic for topic in topics if topic)), None)
     if clock is None:
         raise InputError(f"{path}: {INNOVATIONS} lacks a field 'timestamp'")
-    t = _times(path, INNOVATIONS, innovations[clock])
-    other = _times(path, VARIANCES, variances[clock])
-    if clock == CLOCKS[0]:  # of several with one stamp the first
+    return clock
+
+
+def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
+    clock = _clock(path, innovations, variances)
+    t = times_of(path, INNOVATIONS, innovations[clock])
+    other = times_of(path, VARIANCES, variances[clock])
+    stands = len(t) > 1 and t[0] == t[-1]
+    if innovations[clock] is variances[clock]:  # of one message
+        rows = match = np.arange(len(t))
+    elif stands:
+        raise InputError(f"{path}: the timestamps of {INNOVATIONS} are all {t[0]:g} s, so that none has a partner")
+    elif clock == CLOCKS[0]:  # of several with one stamp the first
         _, rows, match = np.intersect1d(t, other, return_indices=True)
     else:
         rows, match = associate(t, other, TOGETHER)
@@ -143,10 +209,11 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
         if name in variances and not name.startswith("timestamp"):
             own[name] = np.asarray(innovations[name], float)[rows]
             of[name] = np.asarray(variances[name], float)[match]
-    return Pairs(t[rows], own, of, len(t) + len(other) - 2 * len(rows))
+    return Pairs(np.full(len(t), np.nan) if stands else t[rows], own, of, len(t) + len(other) - 2 * len(rows))
 
 
-def _times(path: Path, topic: str, stamps: Array) -> Array:
+def times_of(path: Path, topic: str, stamps: Array) -> Array:
+    """Seconds of timestamps in us, (N,), which must not go back."""
     require_in_order(path, topic, stamps.astype(np.int64))
     return stamps.astype(float) * MICRO
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ TREE = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 SECOND = 1e-9  # s in a nanosecond
 PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
 UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
+TWIST = ("speed", "turn_rate", *(f"{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz"))  # for --by
 ENDLESS = 1e9  # a variance from which on it is not stated
 DAMAGED = "cannot be read as a ROS bag, damaged or cut short"
 Link = tuple[str, str]  # frames of a transform, parent and child
@@ -147,6 +149,7 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
         raise InputError(f"{path}: states no covariance: its variances are {values}")
     missing = ",".join(AXES[i] for i in np.flatnonzero(none))
     note = f"{path}: the variances of {missing} are {values}, so not stated and not judged"
+    note += f", as by --axes {','.join(AXES[i] for i in np.flatnonzero(~none))}"
     return np.flatnonzero(~none).tolist(), note if missing else ""
 
 
@@ -249,7 +252,7 @@ def _lines(bag: Path, reader: Any, topic: str) -> Lines:
     rows = []
     for each in _messages(reader, topic):
         content = getattr(each, "pose", None) or each.transform
-        rows.append(_row(each.header, content))
+        rows.append(np.append(_row(each.header, content), _twist(each)))
     return _track(bag, topic, rows)
 
 
@@ -288,7 +291,17 @@ def _track(bag: Path, topic: str, rows: Iterable[Array]) -> Lines:
     for row in np.flatnonzero(bad):
         what = f"the quaternion at {t[row]:.15g} s has length {length[row]:.4g}, not 1"
         raise InputError(f"{bag}, {topic}: {what}")
-    return Lines(bag, values, first + 1, unit=f"message of {topic}")
+    columns = dict(zip(TWIST, values[:, POSE + FULL :].T, strict=False))
+    return Lines(bag, values[:, : POSE + FULL], first + 1, unit=f"message of {topic}", columns=columns)
+
+
+def _twist(message: Any) -> list[float]:
+    """Speed, m/s, turn rate, rad/s, and their three components each; nothing without a twist."""
+    if not hasattr(message, "twist"):
+        return []
+    of = message.twist.twist
+    parts = [getattr(vector, axis) for vector in (of.linear, of.angular) for axis in "xyz"]
+    return [math.hypot(*parts[:3]), math.hypot(*parts[3:]), *parts]
 
 
 def _row(header: Any, content: Any) -> Array:

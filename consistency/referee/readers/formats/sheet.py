@@ -114,8 +114,9 @@ class TableRows(FileRows):
 
     def renamed(self, columns: Columns | None) -> TableRows:
         """The table with names of ``columns`` in place of its own."""
+        cells = list(self.data.values())
         names = renamed(list(self.data), columns, self.path)
-        return replace(self, data=dict(zip(names, self.data.values(), strict=True)))
+        return replace(self, data={name: cells[place] for name, place in names})
 
     def texts(self, column: str) -> Array:
         return np.array(list(map(str, self.data[column])), object)
@@ -180,10 +181,11 @@ def sheet_of(path: Path, head: Head, columns: Columns | None = None) -> TableRow
     if not (head.comment or head.spaced):
         return read_sheet(path, columns)
     header = 0 if head.comment else head.line
-    lines = read_rows(path, [len(head.names)], f"{len(head.names)} columns as named", header)
+    width = max(head.places) + 1
+    lines = read_rows(path, [width], f"{width} columns as named", header)
     data: dict[str, Column] = {}
-    for name, values in zip(head.names, lines.values.T, strict=True):
-        data.setdefault(name, values)
+    for name, place in zip(head.names, head.places, strict=True):
+        data.setdefault(name, lines.values[:, place])
     return TableRows(path, data, lines.line, "line", lines.open_line, lines.cut)
 
 

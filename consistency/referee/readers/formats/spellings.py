@@ -151,11 +151,19 @@ def unit_in(name: str) -> int | None:
 Columns = Mapping[str, str]  # names of columns here, and those in a file
 
 
-def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[str]:
-    """Names of columns, with those of ``columns`` in place of the file's own.
+class Named(NamedTuple):
+    """A name of a column, and its place in the file."""
 
-    A column that is not named there, but would play the same part, is hidden behind another name. A name here with a
-    ``*`` stands for all columns that begin or end alike. A time keeps the unit that its name in the file states.
+    name: str
+    place: int
+
+
+def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[Named]:
+    """Names of columns, with those of ``columns`` in place of the file's own, in the order of the file.
+
+    Of a column that is named several times the further names stand at the end. A column that is not named there, but
+    would play the same part, is hidden behind another name. A name here with a ``*`` stands for all columns that begin
+    or end alike. A time keeps the unit that its name in the file states.
 
     Raises
     ------
@@ -163,6 +171,7 @@ def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[
         A column is not there, or two get the same name.
     """
     new: dict[int, str] = {}
+    more = []
     for name, old in (columns or {}).items():
         places = _places(names, old)
         if not places:
@@ -170,15 +179,19 @@ def renamed(names: Sequence[str], columns: Columns | None, where: Path) -> list[
             raise InputError(f"{where}: {what}; there are: {listed(names, 12)}")
         for place, rest in places.items():
             require_units([names[place]], where)
-            new[place] = _with_unit(name.replace("*", rest), names[place])
-    taken = set(chain.from_iterable(map(_alike, new.values())))
+            own = _with_unit(name.replace("*", rest), names[place])
+            if new.setdefault(place, own) != own:
+                more.append(Named(own, place))
+    given = [*new.values(), *(each.name for each in more)]
+    taken = set(chain.from_iterable(map(_alike, given)))
     out = []
     for place, name in enumerate(names):
         if place not in new and _plays(name, taken):
             name = f"{name} not used"
-        out.append(new.get(place, name))
-    for name in new.values():
-        if out.count(name) > 1:
+        out.append(Named(new.get(place, name), place))
+    out += more
+    for name in given:
+        if sum(each.name == name for each in out) > 1:
             raise InputError(f"{where}: two columns are named '{name}'")
     return out
 

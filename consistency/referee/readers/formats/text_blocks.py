@@ -6,8 +6,8 @@ import gzip
 import itertools
 import re
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
@@ -238,6 +238,7 @@ class Lines(FileRows):
     rest: Array | None = None  # (N, 3) velocity in the world, m/s, or (N, 9) biases of gyroscope and accelerometer, too
     open_line: int = 0
     cut: str = ""  # note on a line that is left out, because it is cut short
+    columns: Mapping[str, Array] = field(default_factory=dict)  # (N,) each, by name: what --by may name
 
     @property
     def t(self) -> Array:
@@ -253,7 +254,8 @@ class Lines(FileRows):
         rest = self.rest
         if rest is not None:
             rest = rest[keep]
-        return replace(self, values=self.values[keep], line=self.line[keep], rest=rest)
+        columns = {name: cells[keep] for name, cells in self.columns.items()}
+        return replace(self, values=self.values[keep], line=self.line[keep], rest=rest, columns=columns)
 
     def without_cut(self, bad: Array) -> Lines:
         """The lines without the last one if it alone is ``bad``, (N,) of bool, and has no end."""

@@ -40,7 +40,7 @@ from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.spellings import Columns
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
-from consistency.referee.readers.places import one_of_each_kind, refuse
+from consistency.referee.readers.places import listed, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
     ALONE,
@@ -232,18 +232,29 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     """The poses of a run, or positions where these alone have a truth, and a note on what is not judged."""
     own = run.own
     true = run.true
+    by = _own_column(own, r)
     if isinstance(own, Fixes):
-        return fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), ""
+        return replace(fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), by=by), ""
     k, note = judged_rest(own, true, r)
     order = r.covariance_order or ORDERS[0]
     P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
     of_truth = _of_truth(true, own, order, r)
     run = replace(run, own=own.of(slice(0, POSE)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
-    poses = replace(poses, cross=cross, true_covariance=of_truth)
+    poses = replace(poses, cross=cross, true_covariance=of_truth, by=by)
     if _is_point(true):
         poses = point_positions(poses, r.lever_arm, layout.stated != WHOLE)
     return poses, note
+
+
+def _own_column(own: Lines, r: Reading) -> Array | None:
+    """Cells of the column of ``--by``, (N,); None where the file has no columns, or the column is of another one."""
+    if r.by is None or r.by_file is not None or not own.columns:
+        return None
+    if r.by not in own.columns:
+        has = f"has no such column; there are: {listed(list(own.columns), 12)}"
+        raise InputError(f"--by {r.by}: {own.path} {has}; a table with t and the column goes with --by-file")
+    return own.columns[r.by]
 
 
 def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: str, r: Reading) -> Poses:

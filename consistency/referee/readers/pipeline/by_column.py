@@ -15,7 +15,7 @@ from consistency.referee.diagnostics.records.outcome_columns import made_from_er
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, submatrices
+from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, evenly, submatrices
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
@@ -105,9 +105,7 @@ def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
 
 def _some(count: int, parts: int = 1) -> Indices:
     """At most ``ENOUGH`` of so many rows in all, evenly chosen."""
-    most = max(ENOUGH // parts, 2)
-    places = np.linspace(0, max(count - 1, 0), min(count, most))
-    return np.unique(places.astype(np.int64))
+    return evenly(count, max(ENOUGH // parts, 2))
 
 
 def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:

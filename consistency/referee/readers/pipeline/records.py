@@ -18,7 +18,13 @@ from consistency.referee.readers.heading_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
-from consistency.referee.readers.runs_to_record import Track, assemble, estimated_components, in_columns
+from consistency.referee.readers.runs_to_record import (
+    Track,
+    assemble,
+    estimated_components,
+    in_columns,
+    level_components,
+)
 from consistency.referee.readers.truth_matching import (
     AXES,
     ROUNDING,
@@ -102,6 +108,9 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     """Records of the poses of an estimator, and the estimates of each run that they judge, beside their truth."""
     runs = e.runs
     shift = 0.0
+    level: list[str] = []
+    if e.in_space and r.axes is None:
+        judged, level = level_components(e, judged)
     of_clocks: list[str] = []
     of_alignment: dict[str, Any] = {}
     if r.align is not None:
@@ -114,7 +123,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     elif not runs[0].numbered:
         from consistency.referee.readers.clock_offset import clock_shift
 
-        shift, of_clocks = clock_shift(e.said, runs, r.time_offset)
+        shift, of_clocks = clock_shift(e.said, runs, r.time_offset, judged)
     pairs = [_paired(e, p, r, shift) for p in runs]
     notes = [*e.notes, *_left_out(e, runs, pairs)]
     if _start_is_exact(e, runs):
@@ -128,7 +137,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         notes += _space_notes(e, pairs, errors)
         if r.axes is None:
             judged, still = estimated_components(e, errors, judged)
-            notes += still
+            notes += [*level, *still]
     causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
     if e.convention:

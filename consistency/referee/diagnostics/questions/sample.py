@@ -13,7 +13,13 @@ from consistency.referee.diagnostics.questions.scale import means_and_counts, ru
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.valid_covariances import negative
-from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
+from consistency.referee.diagnostics.records.whitening import (
+    all_finite,
+    are_unlike,
+    squared_length,
+    whiten,
+    whiten_group,
+)
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
@@ -112,10 +118,23 @@ class Sample:
         means, counts = by_runs(of_block, self.nees, self.groups.index).T
         return InGroup(np.asarray(means[counts > 0] / self.dof), counts[counts > 0].astype(np.int64))
 
+    @cached_property
+    def counts(self) -> Indices:
+        """Steps of each run that has any, (runs,)."""
+        counts = self.counted.sum(axis=1)
+        return np.asarray(counts[counts > 0])
+
     @property
     def longest(self) -> int:
         """Steps of the longest run."""
-        return int(self.counted.sum(axis=1).max(initial=0))
+        return int(self.counts.max(initial=0))
+
+    @property
+    def shares(self) -> Array | None:
+        """Part of all steps that each run has, (runs,); None where all runs have equally many."""
+        if not are_unlike(self.counts):
+            return None
+        return np.asarray(self.counts / self.nees.shape[1])
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps
-from consistency.referee.diagnostics.records.whitening import mean_and_count
+from consistency.referee.diagnostics.records.whitening import are_unlike, mean_and_count
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
 from consistency.referee.diagnostics.statistics.nees import anees_interval
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array, Indices
@@ -102,7 +103,30 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weight
             nu = float(np.exp(log_nu))
             spread = 2.0 / variance
     above, below = _tails(ratio, runs * nu, spread)
+    if weighted.weights is not None:
+        above = max(above, _skewed_tail(weighted, dof, nu, spread))
     return MeanTest(runs, ratio, nu, spread, above, below)
+
+
+def scale_test_of_lengths(
+    means: Array, dof: int, steps: int, counts: Indices, gaussian: bool = True
+) -> tuple[MeanTest, MeanTest]:
+    """Test with runs of equal weight, and one that also holds where runs end, or have gaps, by what was measured.
+
+    The second has the larger p values of the first and of the test with runs weighted by their number of steps. If a
+    right filter states P_k given its measurements up to step k, and these decide whether the step counts, then
+    E[counts_i (Y_i - 1)] = 0 (optional stopping), but E Y_i is not 1: runs that end early have other errors than runs
+    that end late. Both tests are one where all runs have equally many steps.
+
+    Parameters
+    ----------
+    counts : (runs,), steps of each run
+    """
+    test = scale_test(means, dof, steps, gaussian)
+    if not are_unlike(counts):
+        return test, test
+    by_steps = scale_test(means, dof, steps, gaussian, counts)
+    return test, replace(test, above=max(test.above, by_steps.above), below=max(test.below, by_steps.below))
 
 
 @dataclass(frozen=True)
@@ -220,6 +244,15 @@ def ratio_interval(
     return Interval(ratio, ratio * k / low, upper)
 
 
+def ratio_interval_of_lengths(means: Array, dof: int, confidence: float, counts: Indices) -> Interval:
+    """:func:`ratio_interval` that holds 1 if that of equal weights does or that of runs weighted by their steps."""
+    ratio = ratio_interval(means, dof, confidence)
+    if not are_unlike(counts):
+        return ratio
+    by_steps = ratio_interval(means, dof, confidence, counts)
+    return Interval(ratio.value, min(ratio.low, by_steps.low), max(ratio.high, by_steps.high))
+
+
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:
     """log(2 / CV^2) of the runs' means (runs,), less its first-order bias, and the same with each run left out."""
     means = np.ldexp(means, -np.frexp(means.max())[1])  # exact, and no square leaves the range of numbers
@@ -303,6 +336,26 @@ def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
         return float(upper), float(lower)
     above, below = (special.stdtr(spread, float(special.ndtri(p))) for p in (upper, lower))
     return float(above), float(below)
+
+
+def _skewed_tail(weighted: Weighted, dof: int, nu: float, spread: float) -> float:
+    """Upper p value of a mean of run means with unlike weights, which is more skewed than chi-square(k) / k.
+
+    Runs whose steps are all one and the same are a weighted sum of chi-squares. Otherwise the gamma distribution has
+    the variance 2 / (runs nu) of the mean, and the largest third cumulant that Gaussian errors can have at this
+    variance: 4 / dof times the variance of a run.
+    """
+    assert weighted.weights is not None
+    runs = len(weighted.weights)
+    ratio = weighted.ratio
+    if nu == dof / weighted.squares:
+        upper = weighted_chi_square_tail(ratio, np.repeat(weighted.weights / (runs * dof), dof))
+    else:
+        k = runs * (weighted.squares / weighted.cubes) ** 2 * min(dof**2 / nu, nu * weighted.squares**2)
+        upper = float(special.chdtrc(k, max(k + (ratio - 1.0) * np.sqrt(k * runs * nu), 0.0)))
+    if not np.isfinite(spread):
+        return upper
+    return float(special.stdtr(spread, float(special.ndtri(upper))))
 
 
 def pointwise_band(alive: Indices, dof: int) -> Array:

@@ -150,6 +150,29 @@ def _positive(dof: Value) -> Value:
     return np.where(dof > 0.0, dof, np.nan)[()]
 
 
+def weighted_chi_square_tail(value: float, weights: Array) -> float:
+    """P(sum of weights times independent chi-square(1) > value) by saddlepoint, ``weights`` (k,) not negative.
+
+    Lugannani & Rice (1980) in Barndorff-Nielsen's form, as in Kuonen (1999): relative errors of a few per cent far out
+    in the tail too. Up to the mean, and so near to it that differences would be lost in rounding, 1.
+    """
+    weights = weights[weights > 0]
+    if not np.isfinite(value):
+        return 0.0
+    if value <= weights.sum() + 0.01 * np.sqrt(2.0 * np.square(weights).sum()):
+        return 1.0
+
+    def slope(s: float) -> float:
+        return float((weights / (1.0 - 2.0 * s * weights)).sum()) - value
+
+    end = 0.5 / weights.max() - 0.25 / value  # where the term of the largest weight alone is twice the value
+    s = float(optimize.brentq(slope, 0.0, end, xtol=1e-14 * end))
+    left = 1.0 - 2.0 * s * weights
+    w = np.sqrt(2.0 * s * value + np.log(left).sum())
+    v = s * np.sqrt(2.0 * np.square(weights / left).sum())
+    return float(special.ndtr(-w - np.log(v / w) / w))
+
+
 chi2 = ChiSquare
 t = Student
 beta = Beta

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, scale_test_of_lengths
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
 from consistency.referee.diagnostics.records.whitening import are_unlike, mean_of_runs
+from consistency.referee.diagnostics.statistics.distributions import combined_p_value
 from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
@@ -27,6 +29,7 @@ from consistency.referee.diagnostics.verdict.answers import (
 )
 from consistency.referee.types import Array
 
+EARLY = 0.75  # weight of the first steps in the evidence, where runs have unlike numbers of steps
 GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 
@@ -56,7 +59,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     also : p values of other questions of the same verdict, among which the false-alarm rate is split
     scale : p value of the main question, where it comes from elsewhere
     """
-    main, decides = scale_test_of_lengths(sample.means(), sample.dof, sample.longest, sample.counts)
+    main, decides = scale_tests(sample)
     named = {MAIN: sided_p_value(main, settings)}
     if scale is None:
         scale = sided_p_value(decides, settings)
@@ -66,11 +69,12 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     if sample.whitened is not None:
         whitened = sample.whitened
         in_steps = step_moments(whitened)
-        axes, decide = axis_tests(sample)
+        of_axes = {key: scale_tests(sample, index) for key, index in sample.components.items()}
+        axes = {key: test for key, (test, _) in of_axes.items()}
         p[AXIS] = float("nan")
         if sample.dof > 1:
-            for values, tests in ((named, axes), (p, decide)):
-                values[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in tests.values()]))
+            both = np.array([[sided_p_value(test, settings) for test in tests] for tests in of_axes.values()])
+            named[AXIS], p[AXIS] = (least_of_steps(of_test)[0] for of_test in both.T)
         bias_step = _test_bias(sample, in_steps, p)
         outlier = outliers(whitened, in_steps)
         p["outliers"] = outlier.p_value
@@ -104,13 +108,24 @@ def sided_p_value(test: MeanTest, settings: Settings) -> float:
     return test.p_value
 
 
-def axis_tests(sample: Sample) -> tuple[dict[str, MeanTest], dict[str, MeanTest]]:
-    """Tests of the scale of each component and group by itself: those that name a fault, and those that find it."""
-    name, find = {}, {}
-    for key, index in sample.components.items():
-        means = sample.group_means(index)
-        name[key], find[key] = scale_test_of_lengths(means, len(index), sample.longest, sample.counts)
-    return name, find
+def scale_tests(sample: Sample, index: Sequence[int] | None = None) -> tuple[MeanTest, MeanTest]:
+    """Tests of the scale, of all components or some: that which names a fault, and that which finds it.
+
+    They are the same where runs have equally many steps. Otherwise the second is :func:`scale_test_of_lengths`. In it
+    runs that end early hardly count, so the first steps, which nearly all runs have, are tested as well.
+    """
+    dof = sample.dof if index is None else len(index)
+    means = sample.means if index is None else partial(sample.group_means, index)
+    name, find = scale_test_of_lengths(means(), dof, sample.longest, sample.counts)
+    if not are_unlike(sample.counts):
+        return name, find
+    first = sample.first
+    counts = sample.counted[:, first].sum(axis=1)
+    counts = counts[counts > 0]
+    early = scale_test(means(steps=first), dof, int(counts.max()), weights=counts)
+    above = combined_p_value((early.above, find.above), (EARLY, 1.0 - EARLY))
+    below = combined_p_value((early.below, find.below), (EARLY, 1.0 - EARLY))
+    return name, replace(find, above=max(name.above, above), below=max(name.below, below))
 
 
 def group_tests(sample: Sample) -> tuple[MeanTest, ...]:

@@ -61,7 +61,7 @@ class Inspection:
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
     # None where nothing but the scale is asked
     scale: float  # p value of the scale, valid at any time
-    named: float  # that with which a fault of the scale is named, once one is found
+    named: float = 1.0  # that with which a fault of the scale is named, once one is found
 
     def corrected(self, p_values: Mapping[str, float]) -> dict[str, float]:
         """p values corrected for the number of looks; the share of the scale is the same if it is asked alone."""

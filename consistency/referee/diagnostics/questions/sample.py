@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}
 VELOCITY = {"vx", "vy", "vz"}
+EARLIEST = 0.02  # of the runs, by their end
 
 
 class Centre(NamedTuple):
@@ -123,6 +124,13 @@ class Sample:
         """Steps of each run that has any, (runs,)."""
         counts = self.counted.sum(axis=1)
         return np.asarray(counts[counts > 0])
+
+    @property
+    def first(self) -> slice:
+        """The first steps, up to the last one of the run that is among the first of 50 to end."""
+        there = self.counted[self.counted.any(axis=1)]
+        last = there.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)
+        return slice(0, int(np.quantile(last, EARLIEST, method="lower")) + 1)
 
     @property
     def longest(self) -> int:

@@ -3,7 +3,7 @@
 D is diagonal, with the square root of the factor of each component's block, and F with its floor. Runs are the unit of
 all intervals, so that nothing is assumed about how the steps of a run depend on each other. A run counts by its number
 of steps: with equal weights a right covariance would not have the factor 1 where runs end, or are in a group, by what
-was measured (see :func:`consistency.referee.diagnostics.questions.scale.scale_test_of_lengths`).
+was measured (see :func:`consistency.referee.diagnostics.questions.scale.RunMeans`).
 """
 
 from __future__ import annotations

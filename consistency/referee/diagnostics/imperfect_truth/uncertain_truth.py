@@ -240,9 +240,10 @@ class UncertainTruth:
             share = self.share()
             if self.contrasted:
                 share = 0.0
-            means = sample.means()
+            means = sample.run_means()
+            test = partial(means.find, gaussian=False)
             return equivalence(
-                means, sample.dof, sample.longest, settings, factor, share=share, is_whole=True, counts=sample.counts
+                means.values, means.dof, means.steps, settings, factor, share=share, is_whole=True, test=test
             )
         ratio = float("nan")
         if len(self.by_group[MAIN]):

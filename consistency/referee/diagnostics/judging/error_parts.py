@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,12 +15,7 @@ from consistency.referee.diagnostics.questions.anees_band import Band, simultane
 from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.questions.scale import (
-    acceptance,
-    pointwise_band,
-    ratio_interval,
-    ratio_interval_of_lengths,
-)
+from consistency.referee.diagnostics.questions.scale import RunMeans, acceptance, pointwise_band, ratio_interval
 from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
@@ -108,16 +104,13 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     if settings.tolerance is None:
         return tuple(given)
     R = settings.tolerated
-    steps = sample.longest
     dof = sample.dof
-    counts = sample.counts
-    if not equivalence(sample.means(), sample.dof, steps, settings, R, counts=counts).shown:
+    if not _is_tolerated(sample.run_means(), settings):
         return tuple(given)
     tolerated = {MAIN}
-    if sample.whitened is not None:
-        means = [(sample.group_means(group), len(group)) for group in sample.components.values()]
-        if all(equivalence(each, n, steps, settings, R, counts=counts).shown for each, n in means):
-            tolerated.add(AXIS)
+    groups = sample.components.values() if sample.whitened is not None else []
+    if groups and all(_is_tolerated(sample.run_means(group), settings) for group in groups):
+        tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated.add(DIRECTION)
     by_group = [sample.in_group(number) for number in range(len(tests.groups))]
@@ -127,6 +120,12 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     if not ((curve > tests.band.high * R) | (curve < tests.band.low / R)).any():
         tolerated.add(STEP)
     return with_tolerated(given, tolerated)
+
+
+def _is_tolerated(means: RunMeans, settings: Settings) -> bool:
+    """Whether the ratio is shown to lie within the tolerance."""
+    test = partial(means.find, gaussian=False)
+    return equivalence(means.values, means.dof, means.steps, settings, settings.tolerated, test=test).shown
 
 
 def scale_of(
@@ -152,9 +151,6 @@ def scale_of(
         from consistency.referee.diagnostics.planning.single_log import within
 
         of_log = within(sample.nees[0], dof, settings, shown.factor)
-    late = means
-    if location.since is not None:
-        late = sample.means(from_step(location.since))
     accepted = acceptance(tests.main, dof, rate, settings.allow)
     mean = tests.main.ratio * dof
     if MAIN not in faults and tests.named:  # the test weighted by steps may accept what this one does not
@@ -167,7 +163,7 @@ def scale_of(
         mean_anees=mean,
         accepted=accepted,
         effective_dof=tests.main.effective_dof,
-        inflation=_interval_of(sample, late, dof, CONFIDENCE, faults),
+        inflation=_interval_of(sample, None, location, CONFIDENCE, faults),
         detectable=detectable,
         median_run=median_run,
         worst_run=worst_run,
@@ -177,21 +173,25 @@ def scale_of(
     )
 
 
-def _interval_of(sample: Sample, means: Array, dof: int, confidence: float, faults: set[str]) -> Interval:
-    """Ratio of run means, with an interval of what no question finds: by runs and by steps."""
-    if faults:
-        return ratio_interval(means, dof, confidence)
-    return ratio_interval_of_lengths(means, dof, confidence, sample.counts)
+def _interval_of(
+    sample: Sample, index: Sequence[int] | None, location: Location, confidence: float, faults: set[str]
+) -> Interval:
+    """Ratio of all components or some since the fault began; without a fault by runs and by steps."""
+    if not faults:
+        return sample.run_means(index).interval(confidence)
+    late = from_step(location.since)
+    if index is None:
+        return ratio_interval(sample.means(late), sample.dof, confidence)
+    return ratio_interval(sample.group_means(index, late), len(index), confidence)
 
 
 def axes_of(sample: Sample, tests: Tests, location: Location, faults: set[str]) -> ComponentRatios:
     """Inflation of each component and group, and of velocity, since the fault began."""
-    late = from_step(location.since)
     confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
     reported = sample.reported
     inflation = {}
     for key, index in reported.items():
-        inflation[key] = _interval_of(sample, sample.group_means(index, late), len(index), confidence, faults)
+        inflation[key] = _interval_of(sample, index, location, confidence, faults)
     if tests.largest is None:
         return ComponentRatios(sample.names, reported, inflation)
     return ComponentRatios(sample.names, reported, inflation, tests.largest.ratio, tests.largest.direction)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,10 +11,9 @@ from consistency.referee.diagnostics.questions.anees_band import Band, simultane
 from consistency.referee.diagnostics.questions.bias import StepMoments, hotelling, step_moments, t_squared
 from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, scale_test_of_lengths
+from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
 from consistency.referee.diagnostics.records.whitening import are_unlike, mean_of_runs
-from consistency.referee.diagnostics.statistics.distributions import combined_p_value
 from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
@@ -29,7 +27,6 @@ from consistency.referee.diagnostics.verdict.answers import (
 )
 from consistency.referee.types import Array
 
-EARLY = 0.75  # weight of the first steps in the evidence, where runs have unlike numbers of steps
 GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 
@@ -59,22 +56,24 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     also : p values of other questions of the same verdict, among which the false-alarm rate is split
     scale : p value of the main question, where it comes from elsewhere
     """
-    main, decides = scale_tests(sample)
+    of_runs = sample.run_means()
+    main = of_runs.name()
     named = {MAIN: sided_p_value(main, settings)}
     if scale is None:
-        scale = sided_p_value(decides, settings)
+        scale = sided_p_value(of_runs.find(), settings)
     p = {MAIN: scale}
     axes: dict[str, MeanTest] = {}
     largest = outlier = matrix = bias_step = shape_step = None
     if sample.whitened is not None:
         whitened = sample.whitened
         in_steps = step_moments(whitened)
-        of_axes = {key: scale_tests(sample, index) for key, index in sample.components.items()}
-        axes = {key: test for key, (test, _) in of_axes.items()}
+        of_axes = {key: sample.run_means(index) for key, index in sample.components.items()}
+        axes = {key: of_axis.name() for key, of_axis in of_axes.items()}
         p[AXIS] = float("nan")
         if sample.dof > 1:
-            both = np.array([[sided_p_value(test, settings) for test in tests] for tests in of_axes.values()])
-            named[AXIS], p[AXIS] = (least_of_steps(of_test)[0] for of_test in both.T)
+            find = [of_axis.find() for of_axis in of_axes.values()]
+            for values, tests in ((named, axes.values()), (p, find)):
+                values[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in tests]))
         bias_step = _test_bias(sample, in_steps, p)
         outlier = outliers(whitened, in_steps)
         p["outliers"] = outlier.p_value
@@ -106,26 +105,6 @@ def sided_p_value(test: MeanTest, settings: Settings) -> float:
     if settings.one_sided:
         return test.above
     return test.p_value
-
-
-def scale_tests(sample: Sample, index: Sequence[int] | None = None) -> tuple[MeanTest, MeanTest]:
-    """Tests of the scale, of all components or some: that which names a fault, and that which finds it.
-
-    They are the same where runs have equally many steps. Otherwise the second is :func:`scale_test_of_lengths`. In it
-    runs that end early hardly count, so the first steps, which nearly all runs have, are tested as well.
-    """
-    dof = sample.dof if index is None else len(index)
-    means = sample.means if index is None else partial(sample.group_means, index)
-    name, find = scale_test_of_lengths(means(), dof, sample.longest, sample.counts)
-    if not are_unlike(sample.counts):
-        return name, find
-    first = sample.first
-    counts = sample.counted[:, first].sum(axis=1)
-    counts = counts[counts > 0]
-    early = scale_test(means(steps=first), dof, int(counts.max()), weights=counts)
-    above = combined_p_value((early.above, find.above), (EARLY, 1.0 - EARLY))
-    below = combined_p_value((early.below, find.below), (EARLY, 1.0 - EARLY))
-    return name, replace(find, above=max(name.above, above), below=max(name.below, below))
 
 
 def group_tests(sample: Sample) -> tuple[MeanTest, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -266,7 +267,7 @@ def _equivalence(
         low_is_fault=not record.reduced,
         unseen=record.unseen,
         is_whole=True,
-        counts=sample.counts,
+        test=partial(sample.run_means().find, gaussian=False),
     )
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test, scale_test_of_lengths
+from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.nees import e_processes, ever
 from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence
-from consistency.referee.types import Array, Indices
+from consistency.referee.types import Array
 
 FARTHEST = 15.0  # log of a ratio, beyond which an interval has no end
 HALVINGS = 16  # of an interval in which an end is looked for
@@ -31,7 +31,7 @@ def equivalence(
     share: float = 0.0,
     weights: Array | None = None,
     is_whole: bool = False,
-    counts: Indices | None = None,
+    test: Callable[[float], MeanTest] | None = None,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
@@ -52,23 +52,23 @@ def equivalence(
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
     weights : (runs,), of the runs in the mean; None where they are equal
     is_whole : the interval of the two tests is worked out, too
-    counts : (runs,), steps of each run, with which both tests are those of :func:`scale_test_of_lengths`
+    test : that of the means over a number, in place of :func:`scale_test`
     """
     factor = settings.factor if factor is None else factor
     top = (share + (1.0 - share) * factor) * (1.0 - unseen)
     bottom = share + (1.0 - share) / factor
 
-    def test(size: float) -> MeanTest:
-        if counts is None:
-            return scale_test(means / size, dof, steps, False, weights)
-        return scale_test_of_lengths(means / size, dof, steps, counts, False)[1]
+    def scaled(size: float) -> MeanTest:
+        if test is not None:
+            return test(size)
+        return scale_test(means / size, dof, steps, False, weights)
 
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
-        return test(size).below if size > 0 else 1.0
+        return scaled(size).below if size > 0 else 1.0
 
     def p_above(ratio: float) -> float:
-        return test(share + (1.0 - share) * ratio).above
+        return scaled(share + (1.0 - share) * ratio).above
 
     ratio = float("nan")
     if is_whole and len(means):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
+from consistency.referee.diagnostics.questions.scale import RunMeans, means_and_counts, run_means
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.valid_covariances import negative
@@ -131,6 +131,16 @@ class Sample:
         there = self.counted[self.counted.any(axis=1)]
         last = there.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)
         return slice(0, int(np.quantile(last, EARLIEST, method="lower")) + 1)
+
+    def run_means(self, index: Sequence[int] | None = None) -> RunMeans:
+        """Mean NEES of each run, of all components or some of them."""
+        dof = self.dof if index is None else len(index)
+        means = self.means if index is None else partial(self.group_means, index)
+        early = None
+        if are_unlike(self.counts):
+            counts = self.counted[:, self.first].sum(axis=1)
+            early = RunMeans(means(steps=self.first), counts[counts > 0], dof)
+        return RunMeans(means(), self.counts, dof, early)
 
     @property
     def longest(self) -> int:

@@ -11,7 +11,7 @@ from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps
 from consistency.referee.diagnostics.records.whitening import are_unlike, mean_and_count
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.statistics.distributions import combined_p_value, weighted_chi_square_tail
 from consistency.referee.diagnostics.statistics.nees import anees_interval
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array, Indices
@@ -22,6 +22,7 @@ LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it s
 SKEWNESS = 0.4  # of the bound on it, that the spread is adjusted by
 # 0.2 errs too often where one of 3 axes is constant in half of 102 runs (1.4 times at 1e-3). 0.3 would keep the rates
 # of the question; intervals need more, most where one of 2 axes is constant in all of 21 runs (miss 6.7 %, here 5.5).
+EARLY = 0.75  # weight of the first steps in the evidence, where runs have unlike numbers of steps
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 ITERATIONS = 5  # of the upper end of an interval and the spread there
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
@@ -108,25 +109,56 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weight
     return MeanTest(runs, ratio, nu, spread, above, below)
 
 
-def scale_test_of_lengths(
-    means: Array, dof: int, steps: int, counts: Indices, gaussian: bool = True
-) -> tuple[MeanTest, MeanTest]:
-    """Test with runs of equal weight, and one that also holds where runs end, or have gaps, by what was measured.
+@dataclass(frozen=True)
+class RunMeans:
+    """Mean NEES Y_i of runs over their degrees of freedom, with tests that also hold where runs differ in length.
 
-    The second has the larger p values of the first and of the test with runs weighted by their number of steps. If a
-    right filter states P_k given its measurements up to step k, and these decide whether the step counts, then
-    E[counts_i (Y_i - 1)] = 0 (optional stopping), but E Y_i is not 1: runs that end early have other errors than runs
-    that end late. Both tests are one where all runs have equally many steps.
-
-    Parameters
-    ----------
-    counts : (runs,), steps of each run
+    If a right filter states P_k given its measurements up to step k, and these decide whether a step counts, then
+    E Y_i is not 1: runs that end early have other errors than runs that end late. The sum of counts_i (Y_i - 1) has the
+    mean 0 (optional stopping). So a fault is *found* only if a test with runs weighted by their steps finds it, too.
+    Weighted so, runs that end early hardly count. Therefore the evidence of the first steps, which nearly all runs
+    have, is part of that test. Once a fault is found, runs of equal weight *name* it. Where all runs have equally many
+    steps there is one test.
     """
-    test = scale_test(means, dof, steps, gaussian)
-    if not are_unlike(counts):
-        return test, test
-    by_steps = scale_test(means, dof, steps, gaussian, counts)
-    return test, replace(test, above=max(test.above, by_steps.above), below=max(test.below, by_steps.below))
+
+    values: Array  # (runs,)
+    counts: Indices  # (runs,), steps of each
+    dof: int
+    early: RunMeans | None = None  # of the first steps
+
+    @property
+    def steps(self) -> int:
+        """Steps of the longest run."""
+        return int(self.counts.max(initial=0))
+
+    def name(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
+        """:func:`scale_test` of runs of equal weight, with means over ``size``."""
+        return scale_test(self.values / size, self.dof, self.steps, gaussian)
+
+    def find(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
+        """The same, with the larger p values of both tests."""
+        test = self.name(size, gaussian)
+        if not are_unlike(self.counts):
+            return test
+        tests = [self.by_steps(size, gaussian)]
+        if self.early is not None:
+            tests.append(self.early.by_steps(size, gaussian))
+        weights = (1.0 - EARLY, EARLY)[: len(tests)]
+        above = combined_p_value([each.above for each in tests], weights)
+        below = combined_p_value([each.below for each in tests], weights)
+        return replace(test, above=max(test.above, above), below=max(test.below, below))
+
+    def by_steps(self, size: float, gaussian: bool) -> MeanTest:
+        """:func:`scale_test` of runs weighted by their steps."""
+        return scale_test(self.values / size, self.dof, self.steps, gaussian, self.counts)
+
+    def interval(self, confidence: float = CONFIDENCE) -> Interval:
+        """:func:`ratio_interval` that holds 1 if that of either weights does."""
+        ratio = ratio_interval(self.values, self.dof, confidence)
+        if not are_unlike(self.counts):
+            return ratio
+        by_steps = ratio_interval(self.values, self.dof, confidence, self.counts)
+        return Interval(ratio.value, min(ratio.low, by_steps.low), max(ratio.high, by_steps.high))
 
 
 @dataclass(frozen=True)
@@ -242,15 +274,6 @@ def ratio_interval(
         skewed = len(means) * max(float(least), float(np.exp(log_nu)))
         upper = ratio * skewed / max(float(distributions.chi2.ppf(special.ndtr(-z), skewed)), 1e-300)
     return Interval(ratio, ratio * k / low, upper)
-
-
-def ratio_interval_of_lengths(means: Array, dof: int, confidence: float, counts: Indices) -> Interval:
-    """:func:`ratio_interval` that holds 1 if that of equal weights does or that of runs weighted by their steps."""
-    ratio = ratio_interval(means, dof, confidence)
-    if not are_unlike(counts):
-        return ratio
-    by_steps = ratio_interval(means, dof, confidence, counts)
-    return Interval(ratio.value, min(ratio.low, by_steps.low), max(ratio.high, by_steps.high))
 
 
 def _log_nu_of_means(means: Array) -> tuple[float, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics.questions.bias import StepMoments, step_moments, t_squared
-from consistency.referee.diagnostics.questions.scale import UNKNOWN, ratio_interval, scale_test_of_lengths
+from consistency.referee.diagnostics.questions.scale import UNKNOWN, RunMeans, ratio_interval
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.whitening import all_finite, are_unlike, standardise
 from consistency.referee.diagnostics.statistics import distributions
@@ -74,7 +74,7 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
     (runs, steps, n) -> (n, n), p. Each run is one observation of the mean products of different components,
     n (n - 1) / 2 numbers with mean zero under any scale of each component; :func:`products_test`. (Scales
     that differ are seen by the test of each axis.) Where runs have unlike numbers of steps, p is at least that of the
-    sums of these products, see :func:`scale_test_of_lengths`. p is NaN where there are fewer than 6 (n - 1) runs: with
+    sums of these products, see :class:`RunMeans`. p is NaN where there are fewer than 6 (n - 1) runs: with
     fewer, only gross faults would be found.
     """
     present = all_finite(whitened)
@@ -215,7 +215,7 @@ def largest_direction(whitened: Array) -> Largest:
     largest eigenvalue of the whitened second moment is at most 1; the trace, which is the mean NEES, cannot tell.
     The leading eigenvector of one half of the runs (every other run) is the direction in which the other half is
     judged, and vice versa. Runs are independent, so the errors of each half are independent of its direction, and the
-    test of a single component holds (:func:`scale_test_of_lengths`). Both halves count (Bonferroni).
+    test of a single component holds (:class:`RunMeans`). Both halves count (Bonferroni).
 
     Parameters
     ----------
@@ -228,7 +228,6 @@ def largest_direction(whitened: Array) -> Largest:
         return Largest(UNKNOWN, np.full(n, np.nan), float("nan"))
     count = present.sum(axis=1)
     moments = by_runs(second_moments, whitened, present)[some] / count[some, None, None]
-    steps = int(count.max())
     halves = [np.arange(len(moments)) % 2 == k for k in (0, 1)]
     along = np.empty(len(moments))
     count = count[some]
@@ -236,8 +235,7 @@ def largest_direction(whitened: Array) -> Largest:
     for chosen, judged in (halves, halves[::-1]):
         u = _leading(moments[chosen])
         along[judged] = np.einsum("i,rij,j->r", u, moments[judged], u)
-        _, test = scale_test_of_lengths(along[judged], 1, steps, count[judged])
-        p_values.append(test.above)
+        p_values.append(RunMeans(along[judged], count[judged], 1).find().above)
     return Largest(ratio_interval(along), _leading(moments), min(1.0, 2.0 * min(p_values)))
 
 

@@ -24,8 +24,8 @@ from consistency.referee.fit_covariance.correct import are_needed, fit_groups
 from consistency.referee.fit_covariance.factors import blocks_of
 from consistency.referee.types import Array
 
-GATES, CLEARS = 2000, 400
-QUICK_GATES, QUICK_CLEARS = 50, 20
+GATES, FITS, CLEARS = 2000, 500, 400
+QUICK_GATES, QUICK_FITS, QUICK_CLEARS = 50, 20, 20
 STEPS, RARE = 100, 1e-3
 PROCESS = 0.1  # variance of the process noise in a step, over that of the measurement
 FAR = {1: 3.84, 2: 5.99}  # NIS that 5 % exceed, by its dimension
@@ -204,7 +204,7 @@ def _bets(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
 
 
 def _factors(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
-    gates, blocks = QUICK_GATES if quick else GATES, blocks_of(("x",), 1, False)
+    gates, blocks = QUICK_FITS if quick else FITS, blocks_of(("x",), 1, False)
     for k, runs in enumerate((150,) if quick else (30, 150)):
         rng = np.random.default_rng((seed, 133, k))
         fits = (fit_groups(measured(rng, WORLDS["aligned"], runs), blocks) for _ in range(gates))

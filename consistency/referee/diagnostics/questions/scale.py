@@ -140,12 +140,12 @@ class RunMeans:
         test = self.name(size, gaussian)
         if not are_unlike(self.counts):
             return test
-        tests = [self.by_steps(size, gaussian)]
+        by_steps = self.by_steps(size, gaussian)
+        above, below = by_steps.above, by_steps.below
         if self.early is not None:
-            tests.append(self.early.by_steps(size, gaussian))
-        weights = (1.0 - EARLY, EARLY)[: len(tests)]
-        above = combined_p_value([each.above for each in tests], weights)
-        below = combined_p_value([each.below for each in tests], weights)
+            first = self.early.by_steps(size, gaussian)
+            above = combined_p_value((above, first.above), (1.0 - EARLY, EARLY))
+            below = combined_p_value((below, first.below), (1.0 - EARLY, EARLY))
         return replace(test, above=max(test.above, above), below=max(test.below, below))
 
     def by_steps(self, size: float, gaussian: bool) -> MeanTest:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from consistency.diagnostics import Record, Settings, judge, spread_steps
+from consistency.diagnostics import Record, Settings, judge, look, sequential_design, speaks, spread_steps
 from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
@@ -121,6 +121,15 @@ def test_a_right_filter_is_not_biased_by_where_its_runs_end():
     assert run_tests(sample, Settings(), {}).p_values["bias"] > SURE
 
 
+def test_axes_are_found_by_both_weights_and_named_by_equal_ones():
+    sample = sample_in("goal", 200)
+    tests = run_tests(sample, Settings(), {})
+    axes = [sample.run_means([i]) for i in range(2)]
+    assert list(tests.axes.values()) == [axis.name() for axis in axes]
+    assert tests.named["scale of an axis"] == 2 * min(axis.name().p_value for axis in axes)
+    assert tests.p_values["scale of an axis"] == min(1.0, 2 * min(axis.find().p_value for axis in axes))
+
+
 def test_products_are_weighted_by_steps_too():
     rng = np.random.default_rng(96)
     whitened = rng.standard_normal((40, 12, 2))
@@ -199,6 +208,13 @@ def test_the_e_process_of_a_right_filter_does_not_grow_by_how_its_runs_end():
     first, second = e_processes(sample.means(), 1, sample.shares)
     assert ever(first.both) < SURE
     assert ever(second.both) > SURE
+
+
+def test_no_look_finds_a_scale_wrong_by_how_runs_end():
+    record = lengths.measured(np.random.default_rng(91), lengths.WORLDS["gives up"], 6000)
+    design = sequential_design(1, false_alarm=SURE)
+    assert not speaks(design, record, None)
+    assert not look(design, record, 1.0).faults
 
 
 def test_a_look_names_a_fault_that_the_e_process_of_equal_weights_has():

@@ -54,6 +54,7 @@ MODULES = (
     "calibration_truth",
     "calibration_pieces",
     "calibration_uneven",
+    "calibration_lengths",
     "calibration_spread",
     "calibration_groups",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions

@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.judging.status import deciding_axis
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.nees import e_process, ever
+from consistency.referee.diagnostics.statistics.nees import e_processes, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import RejectionScore
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
@@ -238,7 +238,7 @@ def look(design: Design, evidence: Record, spent: float | None) -> Verdict:
 
 def speaks(design: Design, evidence: Record, spent: float | None) -> bool:
     """Whether this inspection can decide. Between looks only a fault of the scale does."""
-    return spent is not None or _p_of_scale(design, evidence) <= SHARES[MAIN] * design.false_alarm
+    return spent is not None or max(_p_of_scale(design, evidence)) <= SHARES[MAIN] * design.false_alarm
 
 
 def follow(
@@ -303,7 +303,8 @@ def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float
 
 def _inspected(design: Design, evidence: Record, spent: float | None) -> Findings:
     """Findings of an inspection."""
-    return findings_of(evidence, design.settings, Inspection(spent, _p_of_scale(design, evidence)))
+    p_values = _p_of_scale(design, evidence)
+    return findings_of(evidence, design.settings, Inspection(spent, max(p_values), p_values[0]))
 
 
 def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept: Record | None = None) -> Verdict:
@@ -317,12 +318,12 @@ def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept:
     )
 
 
-def _p_of_scale(design: Design, evidence: Record) -> float:
-    """p value of the scale, valid at any time; 1 without truth."""
+def _p_of_scale(design: Design, evidence: Record) -> list[float]:
+    """p values of the scale by each of the :func:`e_processes`, valid at any time; 1 without truth."""
     sample = sample_of(evidence, design.settings)
     if sample is None:
-        return 1.0
-    return ever(e_process(sample.means(), sample.dof).both)
+        return [1.0]
+    return [ever(bets.both) for bets in e_processes(sample.means(), sample.dof, sample.shares)]
 
 
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:

@@ -26,6 +26,7 @@ from consistency.referee.fit_covariance.factors import (
     Fit,
     blocks_of,
     fit_runs,
+    run_weights,
     stated_errors,
     steps_of_runs,
 )
@@ -198,7 +199,7 @@ def correct(
         after=after,
         verdict=verdict_of(with_uncertainty(after.record, blocks, dof)),
         excess=excess_of(after.record, blocks, dof),
-        gain=mean_over_runs(after.scores - before.scores),
+        gain=mean_over_runs(run_weights(after.record) * (after.scores - before.scores)),
     )
 
 
@@ -270,6 +271,7 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
     fits = {}
     names = record.groups.names if record.groups is not None else ()
     whole = fit_runs(record, blocks)
+    asked = max(len(names), 1)
     for number, name in enumerate(names):
         of_group = np.where(group_index(record) == number, nees, np.nan)
         some = replace(record, nees=of_group, groups=None)
@@ -277,7 +279,7 @@ def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
         if there.sum() < 2:
             fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
             continue
-        fit = fit_runs(some.of_runs(np.flatnonzero(there)), blocks)
+        fit = fit_runs(some.of_runs(np.flatnonzero(there)), blocks, asked)
         left_out = iter(fit.left_out)
         of_runs = tuple(next(left_out) if is_there else fit.factors for is_there in there)
         fits[name] = replace(fit, left_out=of_runs, notes=tuple(f"{name}: {note}" for note in fit.notes))

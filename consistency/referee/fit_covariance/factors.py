@@ -1,7 +1,9 @@
 """Factors and floors on a stated covariance, P' = D P D + F: one factor and one floor for each block of components.
 
-D is diagonal, with the square root of the factor of each component's block, and F with its floor. Runs are the unit: a
-run counts by the mean over its steps, so that nothing is assumed about how its steps depend on each other.
+D is diagonal, with the square root of the factor of each component's block, and F with its floor. Runs are the unit of
+all intervals, so that nothing is assumed about how the steps of a run depend on each other. A run counts by its number
+of steps: with equal weights a right covariance would not have the factor 1 where runs end, or are in a group, by what
+was measured (see :func:`consistency.referee.diagnostics.questions.scale.RunMeans`).
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.intervals import (
+    TAIL,
     chance_of_one,
     dof_of_ratio,
+    effective_number,
     floor_interval,
     interval_of_ratio,
     mean_over_runs,
@@ -135,11 +139,19 @@ def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
         yield error[there], P[there]
 
 
-def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
+def run_weights(record: Record) -> Array:
+    """Steps of each run that has any over their mean, (R,)."""
+    assert record.nees is not None
+    counts = np.isfinite(record.nees).sum(axis=1)
+    counts = counts[counts > 0]
+    return np.asarray(counts / counts.mean())
+
+
+def fit_runs(record: Record, blocks: tuple[Block, ...], fits: int = 1) -> Fit:
     """Fit a factor to each block of two runs or more, and a floor where the held-out log score of runs asks for it.
 
     Each run has a step that counts. Where factor and floor can be told apart, the intervals are those of the model with
-    both.
+    both. All of several ``fits`` together have a floor by chance as seldom as one.
     """
     alone = fit_alone(record, blocks)
     free, notes = [], []
@@ -151,7 +163,8 @@ def fit_runs(record: Record, blocks: tuple[Block, ...]) -> Fit:
     if not free:
         return replace(alone, notes=tuple(notes))
     both = fit_with_floors(record, alone, np.array(free))
-    gain = mean_over_runs(held_out_scores(record, both) - held_out_scores(record, alone))
+    gains = held_out_scores(record, both) - held_out_scores(record, alone)
+    gain = mean_over_runs(run_weights(record) * gains, TAIL / fits)
     if gain.low > 0.0:
         notes.append(
             f"with floors the held-out log score of a step gains {gain.value:.2g} [{gain.low:.2g}, {gain.high:.2g}]"
@@ -182,18 +195,20 @@ def held_out_scores(record: Record, fit: Fit) -> Array:
 def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
     """Fit a factor to each block of the errors of two runs or more, without floors."""
     sizes = np.array([len(block) for block in blocks], float)
-    Q = run_moments(record, blocks)
-    factor = fit_factors(Q.mean(axis=0), sizes)
-    left_out = fit_factors((Q.sum(axis=0) - Q) / (len(Q) - 1), sizes)
+    w = run_weights(record)
+    Q = w[:, None, None] * run_moments(record, blocks)
+    factor = fit_factors(Q.sum(axis=0) / w.sum(), sizes)
+    left_out = fit_factors((Q.sum(axis=0) - Q) / (w.sum() - w)[:, None, None], sizes)
+    runs = effective_number(w)
     none = np.zeros(len(blocks))
     values = list(zip(factor.tolist(), left_out.T, strict=True))
     return Fit(
         Factors(blocks, factor, none),
         tuple(Factors(blocks, each, none) for each in left_out),
-        tuple(interval_of_ratio(*value) for value in values),
+        tuple(interval_of_ratio(*value, runs) for value in values),
         (NONE,) * len(blocks),
-        known_dof(left_out, sizes),
-        tuple(chance_of_one(*value) for value in values),
+        known_dof(left_out, sizes, runs),
+        tuple(chance_of_one(*value, runs) for value in values),
     )
 
 
@@ -234,12 +249,12 @@ def fit_factors(Q: Array, sizes: Array) -> Array:
     return np.asarray(x**-2.0)
 
 
-def known_dof(left_out: Array, sizes: Array) -> Array:
-    """Degrees of freedom with which factors (R, B), each without a run, are known where R - 1 runs are fitted.
+def known_dof(left_out: Array, sizes: Array, runs: float) -> Array:
+    """Degrees of freedom with which factors (R, B), each without a run, are known from one run less than ``runs``.
 
     They are at least those of runs whose steps are all the same.
     """
-    return np.asarray(np.maximum(dof_of_ratio(left_out), (len(left_out) - 1) * sizes))
+    return np.asarray(np.maximum(dof_of_ratio(left_out), (runs - 1.0) * sizes))
 
 
 # --- factors and floors -----------------------------------------------------------------------------------------------
@@ -270,7 +285,7 @@ def mean_precision(covariances: Sequence[Array]) -> float:
 def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     """Fit factors and the floors of some blocks by scoring, beginning with the factors ``alone``.
 
-    Runs have the same weight. What is fitted without a run is one step of scoring from the fit of all.
+    What is fitted without a run is one step of scoring from the fit of all.
     """
     blocks = alone.factors.blocks
     B = len(blocks)
@@ -287,10 +302,11 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     open_left_out = theta + solved(others_H, others_g)
     targets = zip(others_H, others_g + others_H @ theta, strict=True)
     left_out = [with_parameters(blocks, free, np.maximum(nonnegative(*target), least)) for target in targets]
+    runs = effective_number(run_weights(record))
     intervals = []
     for i, value in enumerate(theta.tolist()):
         inside = value if value > 2.0 * least[i] else 0.0
-        interval = floor_interval(inside, float(open_value[i]), open_left_out[:, i])
+        interval = floor_interval(inside, float(open_value[i]), open_left_out[:, i], runs)
         intervals.append(interval._replace(value=value))
     floors = dict(zip(free.tolist(), intervals[B:], strict=True))
     factors = with_parameters(blocks, free, theta)
@@ -301,7 +317,7 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
         left_out=tuple(left_out),
         factor=tuple(intervals[:B]),
         floor=tuple(floors.get(b, NONE) for b in range(B)),
-        dof=known_dof(relative_sizes(record, factors, left_out), sizes),
+        dof=known_dof(relative_sizes(record, factors, left_out), sizes, runs),
     )
 
 
@@ -313,13 +329,13 @@ def with_parameters(blocks: tuple[Block, ...], free: Indices, theta: Array) -> F
 
 
 def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
-    """The score of a step, mean of each run: shapes (R,), (R, p) and (R, p, p)."""
+    """The score of a step, mean of each run times its weight: shapes (R,), (R, p) and (R, p, p)."""
     factors = with_parameters(blocks, free, theta)
     found = []
-    for error, P in steps_of_runs(record):
+    for weight, (error, P) in zip(run_weights(record), steps_of_runs(record), strict=True):
         C = factors.applied(P)
         of_run = score_of(error, C, derivatives(C, factors, free))
-        found.append([part / len(error) for part in of_run])
+        found.append([weight * part / len(error) for part in of_run])
     values, gradients, informations = map(np.array, zip(*found, strict=True))
     return values, gradients, informations
 

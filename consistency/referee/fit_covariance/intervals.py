@@ -15,7 +15,7 @@ TAIL = 0.5 * (1.0 - CONFIDENCE)
 LEAST = 1e-12  # variance of the logarithm of a ratio
 
 
-def student(k: int, tail: float = TAIL) -> float:
+def student(k: float, tail: float = TAIL) -> float:
     """Reach of an interval from k values, in standard errors."""
     return float(stats.t.isf(tail, k - 1))
 
@@ -45,29 +45,35 @@ def dof_of_ratio(left_out: Array) -> Array:
     return np.asarray(2.0 / np.maximum(variance, LEAST))
 
 
-def interval_of_ratio(value: float, left_out: Array) -> Interval:
+def effective_number(weights: Array) -> float:
+    """Number of units of equal weight whose mean is known as well as that of units with ``weights`` (k,)."""
+    return float(np.square(weights.sum()) / np.square(weights).sum())
+
+
+def interval_of_ratio(value: float, left_out: Array, runs: float | None = None) -> Interval:
     """Interval of a positive ratio from its values with each run left out, (k,).
 
     The lower end is that of Student's t for the logarithm, the upper that of chi-square(nu) / nu at the same
-    probability: each is the farther one of both, since few runs do not tell how a ratio is distributed.
+    probability: each is the farther one of both, since few runs do not tell how a ratio is distributed. ``runs`` is the
+    :func:`effective_number` of runs with unlike weights.
     """
-    reach = student(len(left_out))
+    reach = student(runs or len(left_out))
     nu = float(dof_of_ratio(left_out))
     low = value * np.exp(-reach * jackknife(np.log(left_out)))
     least = float(stats.chi2.ppf(stats.norm.sf(reach), nu))
     return Interval(value, float(low), value * nu / max(least, 1e-300))
 
 
-def chance_of_one(value: float, left_out: Array) -> float:
+def chance_of_one(value: float, left_out: Array, runs: float | None = None) -> float:
     """Probability of a ratio as far from 1, or farther, where the right one is 1, by :func:`interval_of_ratio`."""
     nu = float(dof_of_ratio(left_out))
     errors = np.log(value) * np.sqrt(0.5 * nu)
     if value < 1.0:
         errors = stats.norm.isf(stats.chi2.cdf(nu * value, nu))
-    return float(min(2.0 * stats.t.sf(errors, len(left_out) - 1), 1.0))
+    return float(min(2.0 * stats.t.sf(errors, (runs or len(left_out)) - 1), 1.0))
 
 
-def floor_interval(value: float, open_value: float, left_out: Array) -> Interval:
+def floor_interval(value: float, open_value: float, left_out: Array, runs: float | None = None) -> Interval:
     """Interval of a variance that may be 0 from its values with each run left out, (k,), which may lie below 0.
 
     It is that of a ratio where none of these is 0, and symmetric otherwise; of a variance of 0 it is one-sided.
@@ -77,17 +83,17 @@ def floor_interval(value: float, open_value: float, left_out: Array) -> Interval
     open_value : the variance that fits best where it may lie below 0
     """
     if value > 0.0 and left_out.min() > 0.0:
-        return interval_of_ratio(value, left_out)
+        return interval_of_ratio(value, left_out, runs)
     tail = 2.0 * TAIL if value == 0.0 else TAIL
-    reach = student(len(left_out), tail) * jackknife(left_out)
+    reach = student(runs or len(left_out), tail) * jackknife(left_out)
     return Interval(value, max(value - reach, 0.0), max(open_value, 0.0) + reach)
 
 
-def mean_over_runs(values: Array) -> Interval:
+def mean_over_runs(values: Array, tail: float = TAIL) -> Interval:
     """Mean of a value of each run, (R,), with Student's interval; of one run its ends are NaN."""
     mean = float(values.mean())
     if len(values) < 2:
         return Interval(mean, float("nan"), float("nan"))
     error = float(values.std(ddof=1) / np.sqrt(len(values)))
-    reach = student(len(values)) * error
+    reach = student(len(values), tail) * error
     return Interval(mean, mean - reach, mean + reach)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import calibration_lengths as lengths
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -406,6 +407,60 @@ def test_a_floor_at_zero_has_a_one_sided_interval():
     assert inside.high == pytest.approx(0.1 + stats.t.isf(0.025, 4) * error)
     away = np.array([0.9, 1.1, 0.95, 1.05])
     assert floor_interval(1.0, 1.0, away) == interval_of_ratio(1.0, away)
+
+
+def ragged(rng, runs=20, steps=30):
+    """A right estimator whose runs have unlike numbers of steps, none of which depends on the errors."""
+    P = covariances(rng, runs, steps, 3)
+    record = record_of(drawn(rng, P), P)
+    assert record.nees is not None
+    counted = np.arange(steps) < rng.integers(2, steps + 1, runs)[:, None]
+    return replace(record, nees=np.where(counted, record.nees, np.nan))
+
+
+def test_runs_count_by_their_steps(rng):
+    record = ragged(rng)
+    counts = np.isfinite(record.nees).sum(axis=1)
+    fit = fit_alone(record, blocks_of(record.axes, 3, False))
+    assert fit.factors.factor == pytest.approx(np.nansum(record.nees) / (3 * counts.sum()))
+    others = np.delete(record.nees, 4, axis=0)
+    assert fit.left_out[4].factor == pytest.approx(np.nansum(others) / (3 * np.delete(counts, 4).sum()))
+    left_out = np.array([each.factor[0] for each in fit.left_out])
+    runs = counts.sum() ** 2 / np.square(counts).sum()
+    assert tuple(fit.factor[0]) == pytest.approx(tuple(interval_of_ratio(fit.factors.factor[0], left_out, runs)))
+    assert fit.factor[0].low < interval_of_ratio(fit.factors.factor[0], left_out).low
+    assert fit.chance[0] == pytest.approx(chance_of_one(fit.factors.factor[0], left_out, runs))
+    nu = 2.0 / (19 * np.log(left_out).var())
+    assert fit.dof[0] == pytest.approx(max(nu, 3 * (runs - 1)))
+
+
+def test_scores_count_by_steps(rng):
+    record = ragged(rng, runs=4)
+    blocks = blocks_of(record.axes, 3, False)
+    value, gradient, information = scores(record, blocks, np.array([0]), np.array([1.2, 0.1]))
+    counts = np.isfinite(record.nees).sum(axis=1)
+    for run in range(4):
+        alone = scores(record.of_runs(np.array([run])), blocks, np.array([0]), np.array([1.2, 0.1]))
+        assert value[run] == pytest.approx(alone[0][0] * counts[run] / counts.mean())
+        assert gradient[run] == pytest.approx(alone[1][0] * counts[run] / counts.mean())
+        assert information[run] == pytest.approx(alone[2][0] * counts[run] / counts.mean())
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_a_right_filter_needs_no_factor_by_how_its_runs_end(seed):
+    """Fails by chance once in 10,000; with equal weights the chance of 1 is below 1e-8."""
+    record = lengths.measured(np.random.default_rng(seed), lengths.WORLDS["aligned"], 6000)
+    fit = fit_alone(record, blocks_of(("x",), 1, False))
+    assert fit.chance[0] > 1e-4
+    means = np.nanmean(record.nees, axis=1)
+    assert chance_of_one(means.mean(), (means.sum() - means) / (len(means) - 1)) < 1e-8
+
+
+def test_several_fits_ask_more_of_a_floor():
+    record = with_floor(np.random.default_rng(6), 2.0, 20.0)
+    blocks = blocks_of(record.axes, 3, False)
+    assert fit_runs(record, blocks, 20).factors.floor[0] > 0.0
+    assert fit_runs(record, blocks, 10**30).factors.floor[0] == 0.0
 
 
 def test_groups_have_factors_of_their_own_runs(rng):

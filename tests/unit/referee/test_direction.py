@@ -9,7 +9,7 @@ from draws import autoregression, fully_dependent, independent, slow_axis, verdi
 from scipy import stats
 
 from consistency.diagnostics import largest_direction, ratio_interval
-from consistency.referee.diagnostics.questions.scale import scale_test
+from consistency.referee.diagnostics.questions.scale import RunMeans
 
 SURE = 1e-5
 
@@ -26,10 +26,10 @@ def by_hand(w):
         values, vectors = np.linalg.eig(sum(chosen) / len(chosen))
         return np.real(vectors[:, np.argmax(np.real(values))])
 
-    longest = max(int(np.isfinite(run).all(axis=1).sum()) for run in w)
     even, odd = direction(moments[1::2]), direction(moments[0::2])  # directions for runs 0, 2, ... and 1, 3, ...
     along = np.array([u @ M @ u for M, u in zip(moments, [even, odd] * len(moments), strict=False)])
-    p = min(scale_test(along[0::2], 1, longest).above, scale_test(along[1::2], 1, longest).above)
+    counts = np.isfinite(w).all(axis=2).sum(axis=1)
+    p = min(RunMeans(along[half], counts[half], 1).find().above for half in (slice(0, None, 2), slice(1, None, 2)))
     return min(1.0, 2.0 * p), along, direction(moments)
 
 

@@ -14,10 +14,10 @@ from consistency.referee.diagnostics.questions.bias import hotelling, t_squared
 from consistency.referee.diagnostics.questions.equivalence import equivalence, equivalent
 from consistency.referee.diagnostics.questions.sample import Sample, sample_of
 from consistency.referee.diagnostics.questions.scale import scale_test
-from consistency.referee.diagnostics.questions.shape import weighted_chi_square_tail
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import mean_of_runs
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
     BIAS,
@@ -240,7 +240,11 @@ class UncertainTruth:
             share = self.share()
             if self.contrasted:
                 share = 0.0
-            return equivalence(sample.means(), sample.dof, sample.longest, settings, factor, share=share, is_whole=True)
+            means = sample.run_means()
+            test = partial(means.find, gaussian=False)
+            return equivalence(
+                means.values, means.dof, means.steps, settings, factor, share=share, is_whole=True, test=test
+            )
         ratio = float("nan")
         if len(self.by_group[MAIN]):
             ratio = (float(self.total.means().mean()) - self.share()) / (1.0 - self.share())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from consistency.referee.diagnostics.questions.anees_band import Band, simultane
 from consistency.referee.diagnostics.questions.bias import hotelling
 from consistency.referee.diagnostics.questions.equivalence import equivalence
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.questions.scale import acceptance, pointwise_band, ratio_interval
+from consistency.referee.diagnostics.questions.scale import RunMeans, acceptance, pointwise_band, ratio_interval
 from consistency.referee.diagnostics.questions.shape import pair_p_values
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
 from consistency.referee.diagnostics.records.record import Record
@@ -73,7 +74,7 @@ def error_parts(
     band = _band_of_fault(sample, tests, faults, settings)
     location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
-    scale = scale_of(sample, tests, scaled, location, shown)
+    scale = scale_of(sample, tests, scaled, location, shown, faults)
     tails = tails_of(tests, record.run_numbers)
     by_group = by_group_of(record, sample, tests, given, settings)
     if sample.whitened is None:
@@ -81,7 +82,7 @@ def error_parts(
     return ErrorParts(
         scale,
         location,
-        axes_of(sample, tests, location),
+        axes_of(sample, tests, location, faults),
         bias_of(sample, tests.bias_step, location, faults),
         shape_of(sample, tests, faults, scaled.false_alarm),
         tails,
@@ -103,15 +104,13 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     if settings.tolerance is None:
         return tuple(given)
     R = settings.tolerated
-    steps = sample.longest
     dof = sample.dof
-    if not equivalence(sample.means(), sample.dof, steps, settings, R).shown:
+    if not _is_tolerated(sample.run_means(), settings):
         return tuple(given)
     tolerated = {MAIN}
-    if sample.whitened is not None:
-        groups = sample.components.values()
-        if all(equivalence(sample.group_means(g), len(g), steps, settings, R).shown for g in groups):
-            tolerated.add(AXIS)
+    groups = sample.components.values() if sample.whitened is not None else []
+    if groups and all(_is_tolerated(sample.run_means(group), settings) for group in groups):
+        tolerated.add(AXIS)
     if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated.add(DIRECTION)
     by_group = [sample.in_group(number) for number in range(len(tests.groups))]
@@ -123,7 +122,15 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     return with_tolerated(given, tolerated)
 
 
-def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence) -> Scale:
+def _is_tolerated(means: RunMeans, settings: Settings) -> bool:
+    """Whether the ratio is shown to lie within the tolerance."""
+    test = partial(means.find, gaussian=False)
+    return equivalence(means.values, means.dof, means.steps, settings, settings.tolerated, test=test).shown
+
+
+def scale_of(
+    sample: Sample, tests: Tests, settings: Settings, location: Location, shown: Equivalence, faults: set[str]
+) -> Scale:
     """Size of the errors; the inflation is that since the fault began, if it began late."""
     dof = sample.dof
     means = sample.means()
@@ -144,18 +151,19 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
         from consistency.referee.diagnostics.planning.single_log import within
 
         of_log = within(sample.nees[0], dof, settings, shown.factor)
-    late = means
-    if location.since is not None:
-        late = sample.means(location.steps)
+    accepted = acceptance(tests.main, dof, rate, settings.allow)
+    mean = tests.main.ratio * dof
+    if MAIN not in faults and tests.named:  # the test weighted by steps may accept what this one does not
+        accepted = min(accepted[0], mean), max(accepted[1], mean)
     return Scale(
         dof=dof,
         anees=curve,
         alive=alive,
         band=band,
-        mean_anees=tests.main.ratio * dof,
-        accepted=acceptance(tests.main, dof, rate, settings.allow),
+        mean_anees=mean,
+        accepted=accepted,
         effective_dof=tests.main.effective_dof,
-        inflation=ratio_interval(late, dof, CONFIDENCE),
+        inflation=_interval_of(sample, None, location, CONFIDENCE, faults),
         detectable=detectable,
         median_run=median_run,
         worst_run=worst_run,
@@ -165,14 +173,25 @@ def scale_of(sample: Sample, tests: Tests, settings: Settings, location: Locatio
     )
 
 
-def axes_of(sample: Sample, tests: Tests, location: Location) -> ComponentRatios:
-    """Inflation of each component and group, and of velocity, since the fault began."""
+def _interval_of(
+    sample: Sample, index: Sequence[int] | None, location: Location, confidence: float, faults: set[str]
+) -> Interval:
+    """Ratio of all components or some since the fault began; without a fault by runs and by steps."""
+    if not faults:
+        return sample.run_means(index).interval(confidence)
     late = location.steps
+    if index is None:
+        return ratio_interval(sample.means(late), sample.dof, confidence)
+    return ratio_interval(sample.group_means(index, late), len(index), confidence)
+
+
+def axes_of(sample: Sample, tests: Tests, location: Location, faults: set[str]) -> ComponentRatios:
+    """Inflation of each component and group, and of velocity, since the fault began."""
     confidence = 1.0 - (1.0 - CONFIDENCE) / len(sample.components)
     reported = sample.reported
     inflation = {}
     for key, index in reported.items():
-        inflation[key] = ratio_interval(sample.group_means(index, late), len(index), confidence)
+        inflation[key] = _interval_of(sample, index, location, confidence, faults)
     if tests.largest is None:
         return ComponentRatios(sample.names, reported, inflation)
     return ComponentRatios(sample.names, reported, inflation, tests.largest.ratio, tests.largest.direction)

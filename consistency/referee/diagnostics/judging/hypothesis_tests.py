@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.questions.outliers import Outlier, beyond_s
 from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test
 from consistency.referee.diagnostics.questions.shape import Largest, largest_direction, mean_shape, sphericity
-from consistency.referee.diagnostics.records.whitening import mean_of_runs
+from consistency.referee.diagnostics.records.whitening import are_unlike, mean_of_runs
 from consistency.referee.diagnostics.statistics.nees import Pit, pit
 from consistency.referee.diagnostics.verdict.answers import (
     AXIS,
@@ -35,7 +35,7 @@ class Tests:
     """p value of each question, NaN where it cannot be asked, and intermediate results."""
 
     p_values: Mapping[str, float]
-    main: MeanTest
+    main: MeanTest  # with runs of equal weight
     band: Band
     pit: Pit
     axes: Mapping[str, MeanTest] = field(default_factory=dict)  # and groups
@@ -45,6 +45,7 @@ class Tests:
     bias_step: int | None = None  # 1..T, with the smallest p value
     shape_step: int | None = None
     groups: tuple[MeanTest, ...] = ()  # of each group of runs and steps
+    named: Mapping[str, float] = field(default_factory=dict)  # p values that name a fault, once one is found
 
 
 def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Tests:
@@ -55,20 +56,25 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     also : p values of other questions of the same verdict, among which the false-alarm rate is split
     scale : p value of the main question, where it comes from elsewhere
     """
-    main = scale_test(sample.means(), sample.dof, sample.longest)
+    of_runs = sample.run_means()
+    main = of_runs.name()
+    named = {MAIN: sided_p_value(main, settings)}
     if scale is None:
-        scale = sided_p_value(main, settings)
+        scale = sided_p_value(of_runs.find(), settings)
     p = {MAIN: scale}
     axes: dict[str, MeanTest] = {}
     largest = outlier = matrix = bias_step = shape_step = None
     if sample.whitened is not None:
         whitened = sample.whitened
         in_steps = step_moments(whitened)
-        axes = axis_tests(sample)
+        of_axes = {key: sample.run_means(index) for key, index in sample.components.items()}
+        axes = {key: of_axis.name() for key, of_axis in of_axes.items()}
         p[AXIS] = float("nan")
         if sample.dof > 1:
-            p[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in axes.values()]))
-        bias_step = _test_bias(whitened, in_steps, p)
+            find = [of_axis.find() for of_axis in of_axes.values()]
+            for values, tests in ((named, axes.values()), (p, find)):
+                values[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in tests]))
+        bias_step = _test_bias(sample, in_steps, p)
         outlier = outliers(whitened, in_steps)
         p["outliers"] = outlier.p_value
         if settings.one_sided:
@@ -89,7 +95,9 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     if sample.nees.shape[1] > 1:
         p[STEP] = band.p_value
-    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step, groups)
+    if not are_unlike(sample.counts):
+        named = {}
+    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step, groups, named)
 
 
 def sided_p_value(test: MeanTest, settings: Settings) -> float:
@@ -97,14 +105,6 @@ def sided_p_value(test: MeanTest, settings: Settings) -> float:
     if settings.one_sided:
         return test.above
     return test.p_value
-
-
-def axis_tests(sample: Sample) -> dict[str, MeanTest]:
-    """Test of the scale of each component and group by itself."""
-    return {
-        key: scale_test(sample.group_means(index), len(index), sample.longest)
-        for key, index in sample.components.items()
-    }
 
 
 def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
@@ -127,13 +127,17 @@ def _distribution(sample: Sample, settings: Settings, distribution: Pit) -> floa
     return largest
 
 
-def _test_bias(whitened: Array, in_steps: StepMoments, p: dict[str, float]) -> int | None:
+def _test_bias(sample: Sample, in_steps: StepMoments, p: dict[str, float]) -> int | None:
     """Put the p values of a mean error into ``p``; the step with the smallest, 1..T."""
+    whitened = sample.whitened
+    assert whitened is not None
     of_runs = mean_of_runs(whitened)
     of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
     p["bias"] = float("nan")
     if len(of_runs) > whitened.shape[-1]:
         p["bias"] = hotelling(of_runs).p_value
+        if are_unlike(sample.counts):
+            p["bias"] = max(p["bias"], hotelling(of_runs * sample.counts[:, None]).p_value)
     if whitened.shape[1] == 1:
         return None
     _, steps = t_squared(whitened, in_steps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,7 @@ from consistency.referee.diagnostics.verdict.answers import (
     answers,
     faults_of,
     least_of_steps,
+    named_p_values,
     with_tolerated,
 )
 from consistency.referee.diagnostics.verdict.parts import (
@@ -62,6 +64,7 @@ class Inspection:
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
     # None where nothing but the scale is asked
     scale: float  # p value of the scale, valid at any time
+    named: float = 1.0  # that with which a fault of the scale is named, once one is found
 
     def corrected(self, p_values: Mapping[str, float]) -> dict[str, float]:
         """p values corrected for the number of looks; the share of the scale is the same if it is asked alone."""
@@ -100,6 +103,7 @@ def findings_of(
         p_values |= joint.p_values
     sample = sample_of(record, settings)
     tests = None
+    named: dict[str, float] = {}
     if sample is not None:
         scale_p_value = None
         if inspection is not None:
@@ -110,8 +114,13 @@ def findings_of(
             asked = truth.p_values(asked, settings)
         if not unshown:
             p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
+        if truth is None or not truth.bounded:
+            named = dict(tests.named)
     if inspection is not None:
         p_values = inspection.corrected(p_values)
+        if named:
+            named = inspection.corrected(named | {MAIN: inspection.named})
+    p_values = named_p_values(p_values, named)
     given_answers = tuple(answers(p_values, settings.false_alarm).values())
     given_answers = with_tolerated(given_answers, _tolerated(joint, innovations, settings))
 
@@ -253,13 +262,20 @@ def _equivalence(
     factor = max(settings.factor, settings.tolerated)
     if truth is not None:
         return truth.equivalence(sample, settings, factor)
-    low_is_fault = not record.reduced
     shown = equivalence(
-        sample.means(), sample.dof, sample.longest, settings, factor, low_is_fault, record.unseen, is_whole=True
+        sample.means(),
+        sample.dof,
+        sample.longest,
+        settings,
+        factor,
+        low_is_fault=not record.reduced,
+        unseen=record.unseen,
+        is_whole=True,
+        test=partial(sample.run_means().find, gaussian=False),
     )
     if inspection is None:
         return shown
-    return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings)))
+    return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings, sample.shares)))
 
 
 def _early_ends(sample: Sample) -> EarlyEnds | None:

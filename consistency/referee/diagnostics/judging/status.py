@@ -183,7 +183,7 @@ def _without_bias(given: Sequence[Answer], settings: Settings, sample: Sample) -
     others = {answer.question: answer.p_value for answer in given if answer.question in INNOVATIONS}
     centred = sample.centred()  # nobody asks the sample again
     tests = run_tests(centred, settings, others)
-    p_values = {question: p for question, p in tests.p_values.items() if question not in BIAS}
+    p_values = {q: p for q, p in (dict(tests.p_values) | dict(tests.named)).items() if q not in BIAS}
     found = answers(p_values | others, settings.false_alarm)
     return centred, tests, {question for question, answer in found.items() if answer.found}
 

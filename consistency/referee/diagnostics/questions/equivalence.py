@@ -10,7 +10,7 @@ from scipy import special
 
 from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.nees import e_process, ever
+from consistency.referee.diagnostics.statistics.nees import e_processes, ever
 from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence
@@ -31,6 +31,7 @@ def equivalence(
     share: float = 0.0,
     weights: Array | None = None,
     is_whole: bool = False,
+    test: Callable[[float], MeanTest] | None = None,
 ) -> Equivalence:
     """Two one-sided tests that the ratio of true to stated covariance lies in [1 / factor, factor].
 
@@ -51,17 +52,23 @@ def equivalence(
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
     weights : (runs,), of the runs in the mean; None where they are equal
     is_whole : the interval of the two tests is worked out, too
+    test : that of the means over a number, in place of :func:`scale_test`
     """
     factor = settings.factor if factor is None else factor
     top = (share + (1.0 - share) * factor) * (1.0 - unseen)
     bottom = share + (1.0 - share) / factor
 
+    def scaled(size: float) -> MeanTest:
+        if test is not None:
+            return test(size)
+        return scale_test(means / size, dof, steps, False, weights)
+
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
-        return scale_test(means / size, dof, steps, False, weights).below if size > 0 else 1.0
+        return scaled(size).below if size > 0 else 1.0
 
     def p_above(ratio: float) -> float:
-        return scale_test(means / (share + (1.0 - share) * ratio), dof, steps, False, weights).above
+        return scaled(share + (1.0 - share) * ratio).above
 
     ratio = float("nan")
     if is_whole and len(means):
@@ -119,20 +126,21 @@ def _end(p_value: Callable[[float], float], ratio: float, sign: float, level: fl
     return ratio * float(np.exp(sign * outside))
 
 
-def equivalence_by_betting(means: Array, dof: int, settings: Settings) -> Equivalence:
+def equivalence_by_betting(means: Array, dof: int, settings: Settings, shares: Array | None = None) -> Equivalence:
     """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence.
 
     Parameters
     ----------
     means : (runs,), mean over its steps of each run's NEES over ``dof``
     dof : components of the error
+    shares : (runs,), see :func:`e_processes`; None where runs have equally many steps
     """
 
     def below(ratio: float) -> float:
-        return ever(e_process(means / ratio, dof).down)
+        return max(ever(bets.down) for bets in e_processes(means / ratio, dof, shares))
 
     def above(ratio: float) -> float:
-        return ever(e_process(means / ratio, dof).up)
+        return max(ever(bets.up) for bets in e_processes(means / ratio, dof, shares))
 
     mean = float("nan")
     if len(means):

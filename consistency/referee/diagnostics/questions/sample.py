@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.scale import means_and_counts, run_means
+from consistency.referee.diagnostics.questions.scale import RunMeans, means_and_counts, run_means
 from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.valid_covariances import negative
-from consistency.referee.diagnostics.records.whitening import all_finite, squared_length, whiten, whiten_group
+from consistency.referee.diagnostics.records.whitening import (
+    all_finite,
+    are_unlike,
+    squared_length,
+    whiten,
+    whiten_group,
+)
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
@@ -23,6 +29,7 @@ if TYPE_CHECKING:
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}
 VELOCITY = {"vx", "vy", "vz"}
+EARLIEST = 0.02  # of the runs, by their end
 
 
 class Centre(NamedTuple):
@@ -112,10 +119,40 @@ class Sample:
         means, counts = by_runs(of_block, self.nees, self.groups.index).T
         return InGroup(np.asarray(means[counts > 0] / self.dof), counts[counts > 0].astype(np.int64))
 
+    @cached_property
+    def counts(self) -> Indices:
+        """Steps of each run that has any, (runs,)."""
+        counts = self.counted.sum(axis=1)
+        return np.asarray(counts[counts > 0])
+
+    @property
+    def first(self) -> slice:
+        """The first steps, up to the last one of the run that is among the first of 50 to end."""
+        there = self.counted[self.counted.any(axis=1)]
+        last = there.shape[1] - 1 - np.argmax(there[:, ::-1], axis=1)
+        return slice(0, int(np.quantile(last, EARLIEST, method="lower")) + 1)
+
+    def run_means(self, index: Sequence[int] | None = None) -> RunMeans:
+        """Mean NEES of each run, of all components or some of them."""
+        dof = self.dof if index is None else len(index)
+        means = self.means if index is None else partial(self.group_means, index)
+        early = None
+        if are_unlike(self.counts):
+            counts = self.counted[:, self.first].sum(axis=1)
+            early = RunMeans(means(steps=self.first), counts[counts > 0], dof)
+        return RunMeans(means(), self.counts, dof, early)
+
     @property
     def longest(self) -> int:
         """Steps of the longest run."""
-        return int(self.counted.sum(axis=1).max(initial=0))
+        return int(self.counts.max(initial=0))
+
+    @property
+    def shares(self) -> Array | None:
+        """Part of all steps that each run has, (runs,); None where all runs have equally many."""
+        if not are_unlike(self.counts):
+            return None
+        return np.asarray(self.counts / self.nees.shape[1])
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from consistency.referee.diagnostics.questions.bias import StepMoments, step_moments, t_squared
-from consistency.referee.diagnostics.questions.scale import UNKNOWN, ratio_interval, scale_test
+from consistency.referee.diagnostics.questions.scale import UNKNOWN, RunMeans, ratio_interval
 from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
-from consistency.referee.diagnostics.records.whitening import all_finite, standardise
+from consistency.referee.diagnostics.records.whitening import all_finite, are_unlike, standardise
 from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.types import Array
 
@@ -72,20 +73,26 @@ def mean_shape(whitened: Array) -> tuple[Array, float]:
 
     (runs, steps, n) -> (n, n), p. Each run is one observation of the mean products of different components,
     n (n - 1) / 2 numbers with mean zero under any scale of each component; :func:`products_test`. (Scales
-    that differ are seen by the test of each axis.) p is NaN where there are fewer than 6 (n - 1) runs: with
+    that differ are seen by the test of each axis.) Where runs have unlike numbers of steps, p is at least that of the
+    sums of these products, see :class:`RunMeans`. p is NaN where there are fewer than 6 (n - 1) runs: with
     fewer, only gross faults would be found.
     """
     present = all_finite(whitened)
     n = whitened.shape[-1]
     count = present.sum(axis=1)
-    M = by_runs(second_moments, whitened, present)[count > 0] / count[count > 0, None, None]
+    count = count[count > 0]
+    sums = by_runs(second_moments, whitened, present)[present.any(axis=1)]
+    M = sums / count[:, None, None]
     mean = M.mean(axis=0) if len(M) else np.full((n, n), np.nan)
     trace = float(np.trace(mean))
     scaled = mean * n / trace if trace > 0 else mean
     if n == 1 or len(M) < 6 * (n - 1) or not trace > 0:
         return scaled, float("nan")
     i, j = np.triu_indices(n, 1)
-    return scaled, products_test(M[:, i, j])
+    p_value = products_test(M[:, i, j])
+    if are_unlike(count):
+        p_value = max(p_value, products_test(sums[:, i, j]))
+    return scaled, p_value
 
 
 def products_test(products: Array) -> float:
@@ -186,29 +193,6 @@ def _in_own_spread(errors: Array, known: Array) -> Array:
         return np.asarray(e / np.sqrt(np.square(e).sum(axis=0) / (N - 1)))
 
 
-def weighted_chi_square_tail(value: float, weights: Array) -> float:
-    """P(sum of weights times independent chi-square(1) > value) by saddlepoint, ``weights`` (k,) not negative.
-
-    Lugannani & Rice (1980) in Barndorff-Nielsen's form, as in Kuonen (1999): relative errors of a few per cent far out
-    in the tail too. Up to the mean, and so near to it that differences would be lost in rounding, 1.
-    """
-    weights = weights[weights > 0]
-    if not np.isfinite(value):
-        return 0.0
-    if value <= weights.sum() + 0.01 * np.sqrt(2.0 * np.square(weights).sum()):
-        return 1.0
-
-    def slope(s: float) -> float:
-        return float((weights / (1.0 - 2.0 * s * weights)).sum()) - value
-
-    end = 0.5 / weights.max() - 0.25 / value  # where the term of the largest weight alone is twice the value
-    s = float(optimize.brentq(slope, 0.0, end, xtol=1e-14 * end))
-    left = 1.0 - 2.0 * s * weights
-    w = np.sqrt(2.0 * s * value + np.log(left).sum())
-    v = s * np.sqrt(2.0 * np.square(weights / left).sum())
-    return float(special.ndtr(-w - np.log(v / w) / w))
-
-
 def second_moments(whitened: Array, present: Array) -> Array:
     """Sum of w w' over the steps of each run, (runs, steps, n) -> (runs, n, n)."""
     w = np.where(present[..., None], whitened, 0.0)
@@ -231,7 +215,7 @@ def largest_direction(whitened: Array) -> Largest:
     largest eigenvalue of the whitened second moment is at most 1; the trace, which is the mean NEES, cannot tell.
     The leading eigenvector of one half of the runs (every other run) is the direction in which the other half is
     judged, and vice versa. Runs are independent, so the errors of each half are independent of its direction, and the
-    test of a single component holds (:func:`scale_test`). Both halves count (Bonferroni).
+    test of a single component holds (:class:`RunMeans`). Both halves count (Bonferroni).
 
     Parameters
     ----------
@@ -244,14 +228,14 @@ def largest_direction(whitened: Array) -> Largest:
         return Largest(UNKNOWN, np.full(n, np.nan), float("nan"))
     count = present.sum(axis=1)
     moments = by_runs(second_moments, whitened, present)[some] / count[some, None, None]
-    steps = int(count.max())
     halves = [np.arange(len(moments)) % 2 == k for k in (0, 1)]
     along = np.empty(len(moments))
+    count = count[some]
     p_values = []
     for chosen, judged in (halves, halves[::-1]):
         u = _leading(moments[chosen])
         along[judged] = np.einsum("i,rij,j->r", u, moments[judged], u)
-        p_values.append(scale_test(along[judged], 1, steps).above)
+        p_values.append(RunMeans(along[judged], count[judged], 1).find().above)
     return Largest(ratio_interval(along), _leading(moments), min(1.0, 2.0 * min(p_values)))
 
 

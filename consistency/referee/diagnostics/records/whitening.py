@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from consistency.referee.diagnostics.records.large_arrays import FEW, block_slices, by_runs
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
 NUMBERS = 2**22  # of matrices that are factored in one call
@@ -148,6 +148,11 @@ def mean_and_count(values: Array, axis: int) -> tuple[Array, Array]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
+def are_unlike(counts: Indices) -> bool:
+    """Whether runs have different numbers of steps, (runs,)."""
+    return len(counts) > 0 and bool(counts.min() < counts.max())
+
+
 def mean_of_runs(values: Array) -> Array:
     """Mean over the steps that a run has, (runs, steps, n) -> (runs, n); NaN where it has none."""
     return by_runs(lambda block: mean_and_count(block, 1)[0], values)
@@ -158,11 +163,17 @@ def spread_steps(present: Array) -> Array:
 
     Runs are independent and steps are not, so one value of each run is an independent sample. Run i takes
     the step at the i-th point of the golden-ratio sequence, which fills the trajectory evenly for any
-    number of runs and does not depend on the data.
+    number of runs and does not depend on the data. Where runs have unlike numbers of steps, these may depend on the
+    data: then a run takes the first step that it has from that point of the longest trajectory on, if there is one.
     """
     present = np.asarray(present, bool)
-    if not present.shape[1]:
+    T = present.shape[1]
+    if not T:
         return np.full(len(present), -1)
+
+    def from_place(present: Array, place: Array) -> Array:
+        there = present & (np.arange(T) >= (place * T).astype(int)[:, None])
+        return np.where(there.any(axis=1), np.argmax(there, axis=1), -1)
 
     def of_block(present: Array, place: Array) -> Array:
         count = present.sum(axis=1)
@@ -171,4 +182,6 @@ def spread_steps(present: Array) -> Array:
         step = np.argmax(present & (nth == rank[:, None]), axis=1)
         return np.where(count > 0, step, -1)
 
-    return by_runs(of_block, present, np.mod(0.5 + np.arange(len(present)) * GOLDEN, 1.0))
+    counts = present.sum(axis=1)
+    of_runs = from_place if are_unlike(counts[counts > 0]) else of_block
+    return by_runs(of_runs, present, np.mod(0.5 + np.arange(len(present)) * GOLDEN, 1.0))

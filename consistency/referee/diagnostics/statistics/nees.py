@@ -212,6 +212,24 @@ def e_process(means: Array, dof: int | Array) -> EProcess:
     return EProcess(_mixture(won), _mixture(np.log((1.0 - KEPT) * gain / expected + KEPT)))
 
 
+def e_processes(means: Array, dof: int, shares: Array | None = None) -> list[EProcess]:
+    """E-process on run means and, where runs have unlike numbers of steps, another one weighted by these.
+
+    With the share s_i of the T steps that run i has, the second bets on 1 + s_i (Y_i - 1), the mean over T steps of the
+    NEES over its degrees of freedom, or 1 in a step that the run does not have. If a right filter states its covariance
+    given what it has measured, and that decides whether a step counts, such a value has the mean 1 and, by Jensen's
+    inequality, factors of :func:`e_process` with a mean of at most 1. A run mean does not have the mean 1 then.
+
+    Parameters
+    ----------
+    shares : (runs,), 1 at most, of a number T that does not depend on the data; None where they are equal
+    """
+    bets = [e_process(means, dof)]
+    if shares is not None:
+        bets.append(e_process(1.0 + shares * (means - 1.0), dof))
+    return bets
+
+
 def ever(values: Array) -> float:
     """p value of an e-process (N,) looked at after every run: 1 over the largest value so far."""
     return min(1.0, 1.0 / float(np.max(values, initial=1.0)))

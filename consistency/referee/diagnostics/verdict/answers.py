@@ -138,6 +138,17 @@ def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answ
     return {question: found[question] for question in asked}
 
 
+def named_p_values(p_values: Mapping[str, float], named: Mapping[str, float]) -> dict[str, float]:
+    """p values with those that ``named`` has in the place of others, each only once some question finds a fault.
+
+    The ``named`` ones are smaller and not valid by themselves. None of them becomes so small that a fault would be
+    found, in all questions together, at a smaller rate than before (a gatekeeping procedure).
+    """
+    share = shares_of([question for question, p in p_values.items() if np.isfinite(p)])
+    least = min((p_values[question] / share[question] for question in share), default=1.0)
+    return dict(p_values) | {q: max(named[q], least * share[q]) for q in named if q in share}
+
+
 def shares_of(questions: Collection[str]) -> dict[str, float]:
     """Share of the false-alarm rate of each of the ``questions`` that are asked together; they add to 1."""
     if set(questions) == {MAIN}:

@@ -131,7 +131,7 @@ def shared_volume(a: tuple[Array, Array], b: tuple[Array, Array]) -> float:
     axes = []
     for i in range(2):
         ends = [of[0][i] + sign * 8 * np.sqrt(of[1][i, i]) for of in (a, b) for sign in (-1, 1)]
-        axes.append(np.linspace(min(ends), max(ends), 1001))
+        axes.append(np.linspace(min(ends), max(ends), 401))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     least = np.minimum(*(stats.multivariate_normal.pdf(grid, *of) for of in (a, b)))
     return float(least.sum() * (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0]))

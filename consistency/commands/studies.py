@@ -173,6 +173,7 @@ def reproduce_command(
     findings = reproduce_findings(only, runs, seed, jobs, out, overwrite, long)
     terminal.show(findings_table(findings))
     if not only and (not_run := left_out(findings)):
+        print("Not run:")
         terminal.show(not_run_table(not_run))
     for path in (out / "findings.json", *write_reports(out, out / "report.html", out / "report.pdf", overwrite=True)):
         print(path)

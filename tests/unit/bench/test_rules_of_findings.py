@@ -146,6 +146,13 @@ def test_skewness_in_the_plane(projection):
     assert np.mean([projection.skewness_p(batch) < 0.05 for batch in skew]) > 0.9
 
 
+def test_skewness_on_a_line(projection):
+    """With one component Mardia's statistic is n / 6 times the squared skewness, corrected for n."""
+    x = np.random.default_rng(1).gamma(9.0, size=40)
+    corrected = 40 * (2 * 41 * 43) / (40 * (41 * 2 - 6)) * stats.skew(x) ** 2 / 6
+    assert projection.skewness_p(x[:, None]) == pytest.approx(stats.chi2.sf(corrected, 1), rel=1e-9)
+
+
 def test_skewness_does_not_depend_on_the_axes(projection):
     points = np.random.default_rng(1).gamma(2.0, size=(80, 2))
     turned = 3.0 + points @ np.array([[2.0, -1.0], [0.5, 4.0]])

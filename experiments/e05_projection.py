@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -10,8 +13,9 @@ import consistency as cs
 from consistency.bench.models.stereo import project, triangulate, triangulate_jacobian
 from consistency.bench.runs.reproduce_findings import script
 from consistency.diagnostics import Normality, normality
+from consistency.referee.types import Array
 
-FINDINGS = ("fig12a", "fig12b")
+FINDINGS = ("fig12a", "fig12b", "fig12a-xy", "fig12b-xy")
 
 F, X, Y = 150.0, 10.0, 1.0  # px, m, m: Herath 2007 sec. 4.5
 SIGMA_U, SIGMA_D = 1.34, 0.65  # px
@@ -33,8 +37,8 @@ ACCEPT_B = (
 
 
 def main(study: cs.Study) -> list[cs.Finding]:
-    """Moments and normality of eq. 21 applied to Gaussian (u, d), fig. 12a and 12b."""
-    rows, text, overlaps, rejecting = [], [], [], []
+    """Moments and normality of eq. 21 applied to Gaussian (u, d), fig. 12a and 12b: of x alone, and of (x, y)."""
+    rows, text, overlaps, rejecting, planes = [], [], [], [], []
     for index, baseline in enumerate((0.09, 0.5)):
         sample = transformed(baseline, np.random.default_rng([study.seed, index]))
         found = sample[sample["d"].between(*SEARCH)]
@@ -42,6 +46,7 @@ def main(study: cs.Study) -> list[cs.Finding]:
         moments = normality(found["x"].to_numpy())
         rejecting.append(rejected(sample["x"].to_numpy()))
         overlaps.append(overlap((X, linear_std(baseline)), (moments.mean, moments.std)))
+        planes.append(plane(sample, found, baseline))
         text.append(described(moments, linear_std(baseline), overlaps[-1], rejecting[-1], len(found) / len(sample)))
     study.tables["fig12"] = pd.concat(rows, ignore_index=True)[["baseline", "x", "y", "u", "d"]]
     common = {
@@ -67,6 +72,93 @@ def main(study: cs.Study) -> list[cs.Finding]:
             published="overlapping Gaussians",
             measured=text[1],
             accept=ACCEPT_B,
+            **common,
+        ),
+        *in_the_plane(study, planes),
+    ]
+
+
+# --- (x, y), as the chapter plots it -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plane:
+    """What :func:`main` finds of x, of (x, y)."""
+
+    rejecting: float  # share of batches
+    shared: float  # volume that both Gaussians have in common
+    measured: tuple[Array, Array]  # mean (2,) and covariance (2, 2) within the search range
+    linear: Array  # (2, 2), covariance by the Jacobian
+
+    @property
+    def words(self) -> str:
+        mean, covariance = self.measured
+        return (
+            f"normality rejected in {100 * self.rejecting:.0f} % of batches; within the search range mean "
+            f"({mean[0]:.2f}, {mean[1]:.2f}) m (true {X:g}, {Y:g}), {deviations(covariance)}; linearised "
+            f"{deviations(self.linear)}; Gaussians share {100 * self.shared:.0f} % of their volume"
+        )
+
+
+def deviations(covariance: Array) -> str:
+    std = np.sqrt(np.diagonal(covariance))
+    return f"std ({std[0]:.2f}, {std[1]:.2f}) m, correlation {covariance[0, 1] / std.prod():.2f}"
+
+
+def plane(sample: pd.DataFrame, found: pd.DataFrame, baseline: float) -> Plane:
+    u0, v0, d0 = project(X, Y, 0.0, F, baseline)
+    J = np.reshape(triangulate_jacobian(u0, v0, d0, F, baseline), (3, 3))[np.ix_([0, 1], [0, 2])]
+    linear = J @ np.diag([SIGMA_U**2, SIGMA_D**2]) @ J.T
+    points = found[["x", "y"]].to_numpy()
+    moments = points.mean(axis=0), np.cov(points.T)
+    batches = sample[["x", "y"]].to_numpy().reshape(-1, BATCH, 2)
+    rejecting = float(np.mean([skewness_p(batch) < LEVEL for batch in batches]))
+    return Plane(rejecting, shared_volume((np.array([X, Y]), linear), moments), moments, linear)
+
+
+def skewness_p(points: Array) -> float:
+    """p value of Mardia's test of multivariate skewness (1970), of points (n, p), with its correction for small n."""
+    n, p = points.shape
+    away = points - points.mean(axis=0)
+    products = away @ np.linalg.solve(away.T @ away / n, away.T)
+    correction = (p + 1) * (n + 1) * (n + 3) / (n * ((n + 1) * (p + 1) - 6))
+    statistic = n * correction * (products**3).mean() / 6
+    return float(stats.chi2.sf(statistic, p * (p + 1) * (p + 2) / 6))
+
+
+def shared_volume(a: tuple[Array, Array], b: tuple[Array, Array]) -> float:
+    """Volume that two Gaussian densities (mean (2,), covariance (2, 2)) share, on a grid of 8 sigma about both."""
+    axes = []
+    for i in range(2):
+        ends = [of[0][i] + sign * 8 * np.sqrt(of[1][i, i]) for of in (a, b) for sign in (-1, 1)]
+        axes.append(np.linspace(min(ends), max(ends), 401))
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    least = np.minimum(*(stats.multivariate_normal.pdf(grid, *of) for of in (a, b)))
+    return float(least.sum() * (axes[0][1] - axes[0][0]) * (axes[1][1] - axes[1][0]))
+
+
+def in_the_plane(study: cs.Study, planes: Sequence[Plane]) -> list[cs.Finding]:
+    common = {"scenario": "none", "statistic": "Mardia's test of skewness of (x, y) in batches of 100; both Gaussians"}
+    return [
+        study.finding(
+            planes[0].rejecting >= REJECTED,
+            id="fig12a-xy",
+            source="Herath 2007, fig. 12a and sec. 4.5",
+            claim="with a 9 cm baseline the transformed (x, y) is clearly not Gaussian",
+            published="not Gaussian",
+            measured=planes[0].words,
+            accept=f"normality of (x, y) is rejected ({LEVEL:.0%}) in at least {REJECTED:.0%} of batches of {BATCH} "
+            "samples",
+            **common,
+        ),
+        study.finding(
+            planes[1].shared >= OVERLAP,
+            id="fig12b-xy",
+            source="Herath 2007, fig. 12b and sec. 4.5",
+            claim="with a 50 cm baseline the linearised and the approximated Gaussian of (x, y) overlap",
+            published="overlapping Gaussians",
+            measured=planes[1].words,
+            accept=f"they share at least {OVERLAP:.0%} of their volume, the rule of fig12b",
             **common,
         ),
     ]

@@ -42,7 +42,8 @@ else:
     conversion = sibling(__file__, "kitti07_log")
 scripts = sibling(__file__, "data_scripts")
 
-FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
+NOT_SHIPPED = "tracks and true poses of KITTI odometry 07"
+FINDINGS = ()  # their names have that of the drive
 
 MAIN, UNGATED, FIVE, TWIN = "", "-ungated", "-five-slots", "-white-twin"  # after the name of the drive
 NAMES = {"0027": "kitti07"}  # of drives, by their file; others are called as it is

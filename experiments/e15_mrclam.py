@@ -31,7 +31,8 @@ else:
     conversion = sibling(__file__, "mrclam_log")
 scripts = sibling(__file__, "data_scripts")
 
-FINDINGS = ()  # the data are not shipped: `consistency reproduce` leaves this script out
+NOT_SHIPPED = "recordings of UTIAS MRCLAM"
+FINDINGS = ()  # their names have that of the drive
 
 ORIGIN, LICENCE = "UTIAS MRCLAM (Leung et al. 2011)", "none stated, public research data"
 FILTERS = ("ekf-rb", "ukf-rb", "iekf-rb", "fej-ekf-rb", "oc-ekf-rb", "ri-ekf-rb", "ideal-ekf-rb")

@@ -28,6 +28,7 @@ drives = sibling(__file__, "image_drives")
 
 FINDINGS = ("fig4-protocol", "fig5a", "fig5b", "fig5c", "fig7-8")
 LONG = True
+NEEDS = "OpenCV (the extra vision)"
 OWN_PROCESS = True  # runs no filter
 
 SOURCE = "Herath et al. 2007"

@@ -36,6 +36,7 @@ drives = sibling(__file__, "image_drives")
 
 FINDINGS = ("fig6", "fig6-shake", "fig9", "fig9-dissimilarity", "exp1-tracks", "static-vs-dynamic", "fig3-chain")
 LONG = True
+NEEDS = "OpenCV (the extra vision)"
 OWN_PROCESS = True  # runs no filter
 
 SOURCE = "Herath et al. 2007"

@@ -33,6 +33,7 @@ from consistency.stereo.visual_odometry.cameras.input_errors import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
 LONG = True
+NEEDS = "OpenCV and CONSISTENCY_DATA=DIR with images of a chessboard (docs/characterise.md)"
 
 DATA = "chessboard_9cm"
 BOARD, SQUARE = (9, 6), 0.02423  # inner corners; m

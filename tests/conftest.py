@@ -28,8 +28,8 @@ LONGER = {
     "frontend_motion", "frontend_rigs", "gather", "guards", "heat", "hints", "ideal", "imaging_chain",
     "imaging_experiments", "imports", "isolating", "joint", "journal", "kept", "kept_cells", "kept_looks", "kernels",
     "lens_models", "log", "log_tables", "monitoring", "montecarlo", "offset", "overview", "own_error",
-    "pytest_plugin", "rig", "recording", "relative", "report_errors", "reporting", "reporting_files", "results",
-    "sensor_experiments", "sequential", "skipping", "slurm", "sources", "static_limit",
+    "own_randomness", "pytest_plugin", "rig", "recording", "relative", "report_errors", "reporting", "reporting_files",
+    "results", "sensor_experiments", "sequential", "skipping", "slurm", "sources", "static_limit",
     "sweeps", "testing", "tuning", "vision_experiments", "vision_shared", "vision_small", "wrong_inputs",
 }  # fmt: skip
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Observation, Trial
@@ -26,11 +28,16 @@ class Problem:
     start: Array  # (3,), pose at step 0, known exactly
     landmarks: Array | None = None  # (N, 3): reference of a linear world, None in any other
     truth: TrialTruth | None = None  # told to a filter that declares ``realisable = False``, None to any other
+    # random numbers of this filter in this run, a function of (seed, run, name of the filter) alone
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
 
 @runtime_checkable
 class Filter(Protocol):
     """Any object with these four; ``name`` is optional and defaults to the class name.
+
+    A filter that draws random numbers takes them from ``Problem.rng``: each run then has its own, and the same ones
+    whenever it is repeated.
 
     ``update`` may return None in place of Info: then there is no NIS. An attribute ``innovations = "optimal"``
     declares that the gain is optimal and no measurement is gated away, so that innovations are white if the

@@ -76,6 +76,7 @@ class Trial:
     landmarks: Array | None = None  # (N, 3), true positions in the world
     source: Indices | None = None  # (M,), in 0..N-1 or -1
     labels: Indices | None = None  # (n_landmarks,), numbers in the files; the ids themselves where None
+    seed: int = 0  # of the study; 0 for a recorded log
 
     def __post_init__(self) -> None:
         # read-only views: one filter cannot change what the next one is given
@@ -170,7 +171,7 @@ class Finding:
     published: str
     measured: str
     accept: str  # numeric rule and its reason
-    verdict: str  # reproduced | not reproduced | refuted
+    verdict: str  # reproduced | not reproduced | not shown (the runs decide neither) | refuted
     runs: int
     seed: int
     scenario: str

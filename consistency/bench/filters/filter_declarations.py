@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from consistency.bench.protocols import Filter, Problem, TrialTruth, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+
+FILTER = 2  # purpose in the spawn key of the seed; 0 and 1 are those of the simulation
 
 
 def name_of(filter_: Filter) -> str:
@@ -54,6 +58,11 @@ def rejects(filter_: Filter) -> bool:
 def is_realisable(filter_: Any) -> bool:
     """False for a filter that declares itself a bound, to be told the truth."""
     return getattr(filter_, "realisable", True) is not False
+
+
+def random_numbers(trial: Trial, name: str) -> np.random.Generator:
+    """Random stream of the filter ``name`` in one run: independent of the noise of the trial and of other filters."""
+    return np.random.default_rng(np.random.SeedSequence(trial.seed, spawn_key=(trial.run, FILTER, *name.encode())))
 
 
 def problem_of(trial: Trial, belief: Belief) -> Problem:

@@ -13,8 +13,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 
 
-def resolve_filters(filters: Sequence[str | Filter], belief: Belief, log: str | None = None) -> list[Filter]:
+def resolve_filters(
+    filters: str | Filter | Sequence[str | Filter], belief: Belief, log: str | None = None
+) -> list[Filter]:
     """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
+    filters = [filters] if isinstance(filters, str | Filter) else filters
     instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
     if not instances:
         raise InputError(f"no filter given; known: {', '.join(filter_names())}")

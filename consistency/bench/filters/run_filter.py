@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, rejects
+from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, random_numbers, rejects
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief
@@ -116,7 +116,7 @@ def step_through(filter_: Any, trial: Trial, belief: Belief, record: RunRecord |
     record = record or RunRecord.empty(T, len(trial.landmark))
     given, rank = own_arrays(trial), _Rank(error)
     reason, map_ = "", None
-    problem = problem_for(filter_, given, belief)
+    problem = replace(problem_for(filter_, given, belief), rng=random_numbers(given, name))
     state: Any = None
     for step in range(1, T + 1):
         record.at[0] = step

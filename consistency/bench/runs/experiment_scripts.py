@@ -21,7 +21,8 @@ def experiments() -> dict[str, ModuleType]:
     compiled when it is needed.
 
     A script that takes long says so with ``LONG = True``; one that runs no filter, and so shares no trials with the
-    others, with ``OWN_PROCESS = True``.
+    others, with ``OWN_PROCESS = True``; one whose data are not shipped with NOT_SHIPPED, what these are, and it
+    needs no ``main``. NEEDS says what else a script needs.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from consistency.bench.runs.resume_results import PLAN, gathered_in
 from consistency.bench.runs.rounds_of_runs import Interrupted as Interrupted
 from consistency.bench.runs.rounds_of_runs import StudyRounds
 from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork, Workers
-from consistency.bench.scenario import Scenario
+from consistency.bench.scenario import Scenario, load_scenario
 from consistency.bench.simulation import draw_landmarks, require_landmarks_in_view
 from consistency.bench.store.journal import Journal
 from consistency.bench.store.recorded_log import Log, require_format, write_log
@@ -32,8 +32,8 @@ from consistency.referee.system.provenance import manifest_of
 
 
 def run_trials(
-    scenario: Scenario,
-    filters: Sequence[str | Filter],
+    scenario: Scenario | str | Path,
+    filters: str | Filter | Sequence[str | Filter],
     runs: int = 50,
     seed: int = 0,
     jobs: int = -1,
@@ -49,7 +49,8 @@ def run_trials(
 
     Parameters
     ----------
-    filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``
+    scenario : a scenario, its name or file
+    filters : names of built-in filters, or objects with ``init``, ``predict``, ``update`` and ``pose``; or a single one
     seed : the results are a function of (scenario, filter, seed, run) alone
     jobs : workers; -1 for one per core. Compiled filters share threads, each other filter has processes of its own.
         An ``executor`` has workers of its own
@@ -90,7 +91,7 @@ def run_trials(
 
 def run_log(
     log: Log,
-    filters: Sequence[str | Filter],
+    filters: str | Filter | Sequence[str | Filter],
     jobs: int = -1,
     timeout: float | None = None,
     memory: float | None = None,
@@ -121,8 +122,8 @@ def workers_for(jobs: int, executor: Executor | None) -> Workers:
 
 @contextmanager
 def studied(
-    scenario: Scenario,
-    filters: Sequence[str | Filter],
+    scenario: Scenario | str | Path,
+    filters: str | Filter | Sequence[str | Filter],
     seed: int,
     workers: Workers,
     timeout: float | None,
@@ -143,6 +144,7 @@ def studied(
     journal : in place of ``out``: what keeps the finished runs, and may hold some; the caller knows that they are of
         this study
     """
+    scenario = load_scenario(scenario)
     instances = resolve_filters(filters, scenario.belief)
     work = TrialWork(Simulated(scenario, seed), Isolation(instances, scenario.belief, timeout, memory))
     planned = {} if plan is None else {PLAN: dict(plan)}

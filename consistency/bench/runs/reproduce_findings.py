@@ -40,7 +40,8 @@ from consistency.referee.system.stopping import end_with_parent, link_to_parent
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for
-REPRODUCED, NOT_REPRODUCED, REFUTED = "reproduced", "not reproduced", "refuted"
+REPRODUCED, NOT_REPRODUCED, NOT_SHOWN, REFUTED = "reproduced", "not reproduced", "not shown", "refuted"
+NOT_RUN = ("experiment", "question", "findings", "how")  # keys of an experiment that was left out
 
 
 class Study:
@@ -70,7 +71,7 @@ class Study:
 
     def results(self, scenario: str | Scenario, filters: Sequence[str]) -> Results:
         """Results of all ``filters`` so far on a scenario; only those not yet run are run."""
-        world = load_scenario(scenario) if isinstance(scenario, str) else scenario
+        world = load_scenario(scenario)
         results_so_far = self.kept.get(world.name)
         if results_so_far is not None and results_so_far.manifest["scenario_hash"] != world.hash:
             raise ValueError(f"two different scenarios are named '{world.name}'")
@@ -89,16 +90,28 @@ class Study:
             self._judged[key] = analyse(results, [filter_name])[filter_name], record_of(results, filter_name)
         return self._judged[key]
 
-    def finding(self, holds: bool, scenario: str, verdict_if_not: str = NOT_REPRODUCED, **text: str) -> Finding:
-        """A finding with this study's runs and seed; ``holds`` says whether its rule was met."""
-        verdict = REPRODUCED if holds else verdict_if_not
+    def finding(self, holds: bool | None, scenario: str, verdict_if_not: str = NOT_REPRODUCED, **text: str) -> Finding:
+        """A finding with this study's runs and seed.
+
+        ``holds`` says whether the rule of the finding was met; None where the runs show neither that it was nor that
+        it was not.
+        """
+        verdict = NOT_SHOWN if holds is None else REPRODUCED if holds else verdict_if_not
         return Finding(verdict=verdict, runs=self.runs, seed=self.seed, scenario=scenario, **text)
 
-    def write(self, out: Path, findings: Sequence[Finding], wall: float, overwrite: bool = False) -> None:
-        """findings.json, extra tables and a folder a scenario, moved into place as a whole."""
+    def write(
+        self,
+        out: Path,
+        findings: Sequence[Finding],
+        wall: float,
+        overwrite: bool = False,
+        not_run: Sequence[dict[str, str]] = (),
+    ) -> None:
+        """Write findings.json, extra tables and a folder for each scenario, moved into place as a whole."""
         manifest = manifest_of(kind="findings", seed=self.seed, runs=self.runs, wall=wall, complete=True)
         manifest["failures"] = sum(len(results.failures) for results in self.kept.values())
         manifest["studies"] = list(self.kept)
+        manifest["not_run"] = list(not_run)
         manifest["scenarios"] = {name: results.manifest.get("scenario") for name, results in self.kept.items()}
 
         def contents(folder: Path) -> None:
@@ -142,16 +155,35 @@ def reproduce(
         An unknown id, a number out of range, or an output folder that cannot be written.
     """
     scripts = experiments()
-    if alone := [name for name in only or () if name in scripts and not scripts[name].FINDINGS]:
-        raise InputError(f"--only {alone[0]}: its data are not shipped; python {scripts[alone[0]].__file__} --help")
+    for name in only or ():
+        for script_name, module in scripts.items():
+            if hasattr(module, "NOT_SHIPPED") and name in (script_name, *module.FINDINGS):
+                raise InputError(f"--only {name}: its data are not shipped; python {module.__file__} --help")
     only = [finding for name in only or () for finding in (scripts[name].FINDINGS if name in scripts else (name,))]
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs, only=only), time.monotonic()
     _compile(selection, study.workers)
     findings = _findings_of(study, selection)
-    study.write(out, findings, time.monotonic() - started, overwrite)
+    study.write(out, findings, time.monotonic() - started, overwrite, [] if only else left_out(findings))
     return findings
+
+
+def left_out(findings: Sequence[Finding]) -> list[dict[str, str]]:
+    """Experiments of which there is no finding, each with the keys :data:`NOT_RUN`."""
+    ids = {finding.id for finding in findings}
+    return [
+        dict(zip(NOT_RUN, (name, first_line_of(module), ", ".join(module.FINDINGS), _how(name, module)), strict=True))
+        for name, module in experiments().items()
+        if not ids.intersection(module.FINDINGS)
+    ]
+
+
+def _how(name: str, module: ModuleType) -> str:
+    """How an experiment is run by itself, and what it needs."""
+    if hasattr(module, "NOT_SHIPPED"):
+        return f"python experiments/{name}.py --data DIR --out DIR; not shipped: {module.NOT_SHIPPED}"
+    return f"consistency reproduce --only {name}" + (f"; needs {module.NEEDS}" if hasattr(module, "NEEDS") else "")
 
 
 def _compile(selection: Sequence[tuple[ModuleType, Sequence[str]]], jobs: int) -> None:
@@ -172,7 +204,7 @@ def _selection(
     selection: list[tuple[ModuleType, Sequence[str]]] = []
     for module in scripts.values():
         ids = [name for name in module.FINDINGS if not only or name in only]
-        if ids and (only or long or not getattr(module, "LONG", False)):
+        if ids and not hasattr(module, "NOT_SHIPPED") and (only or long or not getattr(module, "LONG", False)):
             selection.append((module, ids))
     return selection
 
@@ -278,3 +310,18 @@ def findings_table(findings: Sequence[Finding]) -> Table:
         (f.id, f.published, f.measured, Status(outcome(f.source, f.verdict))) for f in findings
     ]
     return table(columns, rows, "Findings", style="prose")
+
+
+def not_run_table(entries: list[dict[str, str]]) -> Table:
+    """What :func:`left_out` returns, as a table.
+
+    Raises
+    ------
+    ValueError
+        The entries are not a list of experiments with these keys.
+    """
+    if not isinstance(entries, list) or not all(isinstance(each, dict) and {*each} == {*NOT_RUN} for each in entries):
+        raise ValueError(f"an experiment has the keys {', '.join(NOT_RUN)}")
+    columns = tuple(map(Column, ("experiment", "question", "findings", "how to run it")))
+    rows: list[tuple[Cell, ...]] = [tuple(str(each[key]) for key in NOT_RUN) for each in entries]
+    return table(columns, rows, "Not run", style="prose")

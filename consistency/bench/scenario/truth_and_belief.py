@@ -143,14 +143,16 @@ def scenario_names() -> list[str]:
     return sorted(path.stem for path in data_folder("scenarios").glob("*.toml"))
 
 
-def load_scenario(name: str | Path) -> Scenario:
-    """Scenario by built-in name or by path to a ``.toml`` file.
+def load_scenario(name: str | Path | Scenario) -> Scenario:
+    """Scenario by built-in name or by path to a ``.toml`` file; a scenario is returned as it is.
 
     Raises
     ------
     InputError
         Unknown name, unreadable file, unknown key or a value that is not allowed.
     """
+    if isinstance(name, Scenario):
+        return name
     path = Path(name)
     if str(name) in scenario_names():
         path = data_folder("scenarios") / f"{name}.toml"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from consistency.bench.scenario import (
     TrueSensor,
     Truth,
     UvdSensor,
+    load_scenario,
 )
 from consistency.bench.scenario.effects import (
     Context,
@@ -169,6 +171,7 @@ class World:
             true_path,
             self.landmarks,
             None if np.array_equal(observations.sources, observations.landmark) else observations.source,
+            seed=seed,
         )
 
     def _drive(self, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -183,15 +186,15 @@ class World:
         return motion.dead_reckoning(self.start, planned + noise), planned
 
 
-def simulate(scenario: Scenario, run: int = 0, seed: int = 0) -> Trial:
-    """Truth, controls and observations of run ``run``.
+def simulate(scenario: Scenario | str | Path, run: int = 0, seed: int = 0) -> Trial:
+    """Truth, controls and observations of run ``run`` of a scenario, which may be given by its name or file.
 
     Returns
     -------
     Trial
         Observations are ordered by step, then by landmark.
     """
-    return World(scenario.truth).trial(run, seed)
+    return World(load_scenario(scenario).truth).trial(run, seed)
 
 
 def draw_landmarks(truth: Truth) -> Array:

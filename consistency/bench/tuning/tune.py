@@ -64,7 +64,7 @@ def tune(
         Unknown names, numbers out of range, nothing to fit by, or a filter that fails at every start.
     """
     began = time.monotonic()
-    world = load_scenario(world) if isinstance(world, str | Path) else world
+    world = world if isinstance(world, Log) else load_scenario(world)
     instance = get_filter(filter_) if isinstance(filter_, str) else filter_
     resolve_filters([instance], world.belief, world.name if isinstance(world, Log) else None)
     noise_groups = noise_groups_of(groups, world.belief)

@@ -1,15 +1,21 @@
 """How reproduce runs scripts: which of them, in which process, and what becomes of one that breaks."""
 
+import json
 import os
 import time
 
 import pandas as pd
 import pytest
+import typer
 
 from consistency import InputError
+from consistency.bench.pages.results_report import build_report, compose
 from consistency.bench.runs import experiment_scripts
 from consistency.bench.runs import reproduce_findings as module
 from consistency.bench.runs.reproduce_findings import Study, reproduce
+from consistency.commands.studies import reproduce_command
+from consistency.referee.document.blocks import Heading
+from consistency.referee.system.folders import read_manifest
 
 SCRIPT = '''"""A question."""
 import os
@@ -80,6 +86,85 @@ def test_the_same_findings_with_any_number_of_workers(scripts, tmp_path):
 )
 def test_long_scripts_wait_to_be_asked_for(scripts, tmp_path, only, long, expected):
     assert list(measured(reproduce(only, 5, 0, 1, tmp_path / "out", long=long))) == expected
+
+
+def test_what_was_not_run_is_listed_with_how_to_run_it(scripts, tmp_path):
+    write(scripts, 5, ("five", "cinq"), "NOT_SHIPPED = 'images of a drive'")
+    write(scripts, 6, (), "NOT_SHIPPED = 'a log'")
+    write(scripts, 7, ("seven",), "NEEDS = 'OpenCV'", "return []")
+    reproduce(None, 5, 0, 1, tmp_path / "short")
+    reproduce(None, 5, 0, 1, tmp_path / "all", long=True)
+    reproduce(["one"], 5, 0, 1, tmp_path / "one")
+    listed = {name: read_manifest(tmp_path / name)["not_run"] for name in ("short", "all", "one")}
+    assert {entry["experiment"]: entry["how"] for entry in listed["short"]} == {
+        "e03_script": "consistency reproduce --only e03_script",
+        "e05_script": "python experiments/e05_script.py --data DIR --out DIR; not shipped: images of a drive",
+        "e06_script": "python experiments/e06_script.py --data DIR --out DIR; not shipped: a log",
+        "e07_script": "consistency reproduce --only e07_script; needs OpenCV",
+    }
+    assert [entry["findings"] for entry in listed["short"]] == ["three", "five, cinq", "", "seven"]
+    assert {entry["question"] for entry in listed["short"]} == {"A question."}
+    assert [entry["experiment"] for entry in listed["all"]] == ["e05_script", "e06_script", "e07_script"]
+    assert listed["one"] == []
+
+
+@pytest.mark.parametrize("name", ["e05_script", "cinq"])
+def test_a_finding_on_data_that_are_not_shipped_is_refused(scripts, tmp_path, name):
+    write(scripts, 5, ("five", "cinq"), "NOT_SHIPPED = 'images of a drive'")
+    with pytest.raises(InputError, match=rf"--only {name}: its data are not shipped; python .*e05_script\.py --help"):
+        reproduce([name], 5, 0, 1, tmp_path / "out")
+
+
+def test_the_report_lists_what_was_not_run(scripts, tmp_path):
+    reproduce(None, 5, 0, 1, tmp_path / "out")
+    chapter = next(each for each in compose(build_report(tmp_path / "out")).chapters if each.anchor == "findings")
+    for shown in (chapter.blocks, chapter.on_paper):
+        _, heading, table = shown
+        assert heading == Heading("Not run")
+        ((_, rows),) = table.groups
+        assert rows == (("e03_script", "A question.", "three", "consistency reproduce --only e03_script"),)
+    manifest = tmp_path / "out/manifest.json"
+    content = json.loads(manifest.read_text())
+    for broken in (["three"], [{"experiment": "e03"}], 7, {"a": 1}):
+        manifest.write_text(json.dumps(content | {"not_run": broken}))
+        with pytest.raises(InputError, match=r"manifest\.json: key 'not_run'"):
+            compose(build_report(tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    "source, holds, status, said",
+    [
+        ("Herath 2007", True, 0, ""),
+        ("Herath 2007", None, 0, "not shown: one"),
+        ("Herath 2007", False, 1, "not reproduced: one"),
+        ("this project", None, 0, "not shown: one"),
+        ("this project", False, 0, "not shown: one"),
+    ],
+)
+def test_exit_status_of_each_verdict(tmp_path, monkeypatch, capsys, source, holds, status, said):
+    text = dict.fromkeys(("claim", "statistic", "published", "measured", "accept"), "text")
+    finding = Study(jobs=1).finding(holds, "none", id="one", source=source, **text)
+    monkeypatch.setattr(module, "reproduce", lambda *_: [finding])
+    monkeypatch.setattr("consistency.bench.pages.write_reports", lambda *_, **__: ())
+    ended = 0
+    try:
+        reproduce_command(["one"], jobs=1, out=tmp_path)
+    except typer.Exit as exit_:
+        ended = exit_.exit_code
+    assert ended == status
+    assert capsys.readouterr().err.strip() == said
+
+
+def test_the_terminal_lists_what_was_not_run(scripts, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("consistency.bench.pages.write_reports", lambda *_, **__: ())
+    reproduce_command(None, jobs=1, out=tmp_path / "out")
+    assert "consistency reproduce --only e03_script" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_finding_of_none_is_not_shown():
+    text = dict.fromkeys(("id", "source", "claim", "statistic", "published", "measured", "accept"), "text")
+    verdicts = [Study(jobs=1).finding(holds, "none", "refuted", **text).verdict for holds in (True, False, None)]
+    assert verdicts == ["reproduced", "refuted", "not shown"]
 
 
 def test_scripts_are_said_as_they_begin(scripts, tmp_path, monkeypatch, capfd):

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from consistency.bench.pages.sections.report_input import Report
+from consistency.bench.runs.reproduce_findings import not_run_table
 from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
 from consistency.referee.document.blocks import Block, Cell, Column, Figure, Heading, Small, Stack, Status, Table, table
@@ -82,13 +83,22 @@ def claims_table(findings: Sequence[dict[str, Any]], label: str, caption: str = 
 def all_findings(report: Report) -> tuple[Block, ...]:
     """Published claims of the folder beside what was measured."""
     caption = "Rules of acceptance are constants of the scripts, fixed before this run"
-    return (claims_table(report.findings, "Findings", caption),) if report.findings else ()
+    return _with_not_run(report, claims_table(report.findings, "Findings", caption)) if report.findings else ()
 
 
 def findings_on_paper(report: Report) -> tuple[Block, ...]:
     """The same without the rules."""
     caption = "The rule by which each is accepted, fixed before this run, stands in the HTML page"
-    return (claims_table(report.findings, "Findings", caption, with_rules=False),) if report.findings else ()
+    shown = claims_table(report.findings, "Findings", caption, with_rules=False)
+    return _with_not_run(report, shown) if report.findings else ()
+
+
+def _with_not_run(report: Report, findings: Table) -> tuple[Block, ...]:
+    """The findings, then the experiments that were not run and how to run them."""
+    if not (entries := report.manifest.get("not_run")):
+        return (findings,)
+    with reading(report.folder / "manifest.json", "key 'not_run' cannot be read; write the folder again"):
+        return findings, Heading("Not run"), not_run_table(entries)
 
 
 def _row(finding: dict[str, Any], with_rules: bool) -> tuple[Cell, ...]:

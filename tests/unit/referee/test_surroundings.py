@@ -23,6 +23,7 @@ from consistency.referee.readers.formats import file_kinds
 from consistency.referee.readers.formats.sheet import read_sheet, require_distinct
 from consistency.referee.readers.formats.text_blocks import Block, floats, read_numbers
 from consistency.referee.readers.mix_ups.reading_fit import fit_of
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.show import as_md, svg
 from consistency.referee.show.matplotlib_style import canvas
 from consistency.referee.system import stopping
@@ -329,3 +330,13 @@ def test_blocks_of_numbers_and_of_others_are_one_file(tmp_path, monkeypatch, siz
     assert lines.values[:, 2].tolist() == [-k for k in range(1, 100) if k != 31]
     with pytest.raises(cs.InputError, match=r"a\.txt, line 1: has 3 columns; should be t a"):
         read_numbers(tmp_path / "a.txt", (2,), "t a")
+
+
+def test_sound_poses_have_no_variance_that_counts_as_none():
+    P = np.tile(np.diag([1e-25, 1e-23, 4.0]), (2, 1, 1))
+    P[:, 0, 2] = P[:, 2, 0] = 1e-14
+    t, pose = np.arange(2.0), np.zeros((2, 3))
+    poses = Poses(lambda _: "", t, pose, P, np.ones(2, bool), t, pose, "planar", "so2", 0.01)
+    assert poses.sound().variances.tolist() == [[0.0, 1e-23, 4.0]] * 2
+    assert poses.sound().covariance[0, 0, 2] == 1e-14
+    assert poses.covariance[0, 0, 0] == 1e-25

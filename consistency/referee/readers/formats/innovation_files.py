@@ -15,7 +15,6 @@ from consistency.referee.readers.formats.archive_arrays import Archive, load_arr
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
 from consistency.referee.readers.formats.innovation_columns import with_nis
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, CsvTable, TableRows, checked_dof, read_sheet
-from consistency.referee.readers.formats.spellings import renamed
 from consistency.referee.readers.formats.table_columns import row_order, with_clock
 from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
@@ -192,12 +191,11 @@ def stream_nis(lines: Iterable[str], name: str, r: Reading = DEFAULT) -> Iterato
             continue
         fields = table.row(number, text)
         if fields is None:
-            table.names = renamed(table.names, r.columns, table.path)
             empty = TableRows(table.path, dict.fromkeys(table.names, np.empty(0)), np.empty(0, int), "line")
-            _require_one_run(name, list(with_nis(empty, r.dof)[0].data))
+            _require_one_run(name, list(with_nis(empty.renamed(r.columns), r.dof)[0].data))
             continue
         row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
-        row, _ = with_nis(row, r.dof)
+        row, _ = with_nis(row.renamed(r.columns), r.dof)
         nis = float(row.numbers("nis")[0])
         dof = float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:

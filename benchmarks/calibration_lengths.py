@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
+from calibration_cases import DETECT, FALSE_ALARM, POWER
 from calibration_gates import row, shared
 
-from consistency.diagnostics import Record, Settings, follow, gate_runs, judge, sequential_design
+from consistency.diagnostics import Record, Settings, gate_runs, judge
 from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.groups_by_column import column_of, groups_of
@@ -264,10 +264,3 @@ def _cleared(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng((seed, 137, k))
         found = sum(judge(_of_lengths(rng, lengths, 100, 1.0), settings).consistent for _ in range(gates))
         yield row(world, CLEARED, 1.0, 100, SHOWN, ">=", gates, found)
-
-
-def runs_until_decided(rng: np.random.Generator, lengths: Lengths) -> tuple[str, int]:
-    """Status of a right filter by `--until-decided`, and the runs that it took."""
-    design = sequential_design(3, max_runs=MOST)
-    verdict, runs = follow(design, _of_lengths(rng, lengths, MOST, 1.0).first_runs, MOST)
-    return verdict.status, runs

@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.statistics.nees import e_processes, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import RejectionScore
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
+from consistency.referee.diagnostics.words.same_truth import same_truth
 from consistency.referee.diagnostics.words.sentences import (
     details,
     other_ways,
@@ -119,7 +120,7 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
     causes = (*judged.causes, *_causes_of_innovations(judged, found)) or tuple(level_causes(found))
     return _verdict(
         found,
-        [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)],
+        [sentence, *figures, *causes, *same_truth(judged, found), *other_ways(found.status, judged)],
         left_out_steps=tuple(sorted(left_out)),
         convention=convention,
         align=align,
@@ -142,15 +143,6 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
     if found.scale is not None:
         nees_ratio = found.scale.mean_anees / found.scale.dof
     return innovation_causes(*innovations, nees_ratio)
-
-
-def _same_truth(record: Record, found: Findings) -> list[str]:
-    """That runs share their truth; the module is loaded where steps are below their band."""
-    if record.path is None or found.location is None or not found.location.steps_below:
-        return []
-    from consistency.referee.diagnostics.words.same_truth import same_truth
-
-    return same_truth(record, found)
 
 
 def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None:

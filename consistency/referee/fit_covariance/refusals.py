@@ -25,6 +25,7 @@ from consistency.referee.fit_covariance.motion_windows import (
 )
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_mean, no_mean
 from consistency.referee.fit_covariance.white_noise import WhiteNoise
+from consistency.referee.geometry.lie_groups import inverse, log
 from consistency.referee.readers.pipeline.relative_motions import BENT
 from consistency.referee.types import Array
 
@@ -145,10 +146,16 @@ def require_sound(windows: DriveWindows, correct: bool) -> None:
                 "longer spans: one was taken from the other, and no error of rotations is left to fit; give those "
                 "that the odometry estimates itself"
             )
+        power = f"the squared rotation error grows with the span to the power of {growth.power:.2g} (1 is white noise)"
+        if _rows_are_independent(windows.drives):
+            raise InputError(
+                f"{power}, and not from one row to four either: errors are independent from row to row, as those of "
+                "detections or fixes, which are no odometry. Their covariance is that of a pose: state a constant one "
+                "with them, and 'consistency correct' finds its factors"
+            )
         raise InputError(
-            f"the squared rotation error grows with the span to the power of {growth.power:.2g} (1 is white noise): "
-            "loops are closed, or a map is used, and these poses hold no increments; record the live odometry, before "
-            "loops are closed or a map corrects it"
+            f"{power}: loops are closed, or a map is used, and these poses hold no increments; record the live "
+            "odometry, before loops are closed or a map corrects it"
         )
     turn = body_turn(windows)
     if turn.share > TURNED and turn.chance < RARE:
@@ -163,6 +170,18 @@ def require_sound(windows: DriveWindows, correct: bool) -> None:
             f"the true way is {scale:.3g} times the estimated one: the scale is not metric, as with a single camera; "
             "fit after the scale is known (stereo, inertial, wheels), or state it by a scale state"
         )
+
+
+def _rows_are_independent(drives: Sequence[Drive]) -> bool:
+    """Whether the squared rotation error is hardly larger over four rows than over one."""
+    squares = []
+    for rows in (1, 4):
+        errors = []
+        for drive in drives:
+            moved = [inverse(T[:-rows]) @ T[rows:] for T in (drive.estimate, drive.truth)]
+            errors.append(log(inverse(moved[0]) @ moved[1])[:, drive.d :])
+        squares.append(np.square(np.concatenate(errors)).sum(axis=1).mean())
+    return bool(squares[1] < SCALE * squares[0])
 
 
 def body_turn(windows: DriveWindows) -> BodyTurn:

@@ -5,15 +5,22 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from consistency.referee.diagnostics.records.large_arrays import of_runs
-from consistency.referee.diagnostics.records.record import Record, arrays_of
-from consistency.referee.diagnostics.records.valid_covariances import ROUNDED, Validity, asymmetric, classify
+from consistency.referee.diagnostics.records.record import INDEFINITE, Record, arrays_of
+from consistency.referee.diagnostics.records.valid_covariances import (
+    DEFICIENT,
+    ROUNDED,
+    Validity,
+    asymmetric,
+    classify,
+)
 from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
 from consistency.referee.readers.truth_matching import Estimator, Poses, at, finite_rows, submatrices
@@ -28,6 +35,7 @@ LEVEL = (
     "plane, and their variances are one constant each; --axes {} judges them, too"
 )
 FIXED = "never change in the estimates, but in the truth or in their variance; if they are not estimated, add --axes {}"
+MIXED = 0.01  # of the largest entry, beyond which two that should be the same are not so by rounding
 NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
 NO_CHANGE = 1e-6  # m or rad: rounding, to four bytes or in a text, of a height or a tilt that never changes
 FEWEST = 3  # rows of a run that show that
@@ -202,10 +210,21 @@ def symmetric(covariance: Array, place: Callable[[int], str], one_triangle: bool
             if one_triangle:
                 P = np.where(P == 0, np.swapaxes(P, -1, -2), P)
             rows = Places(place, np.arange(piece.start, piece.stop))
-            what = "the covariance is not symmetric; write P = (P + P') / 2"
-            refuse(asymmetric(P, ROUNDED), rows.__getitem__, what)
+            refuse(asymmetric(P, ROUNDED), rows.__getitem__, partial(_asymmetric_text, P))
             out[piece] = 0.5 * (P + np.swapaxes(P, -1, -2))
     return out
+
+
+def _asymmetric_text(P: Array, row: int) -> str:
+    """What is wrong with a matrix that is not symmetric, by the pair of entries that differ most."""
+    gap = np.abs(P[row] - P[row].T)
+    i, j = (int(k) for k in np.unravel_index(gap.argmax(), gap.shape))
+    if gap[i, j] <= MIXED * np.abs(P[row]).max():
+        return "the covariance is not symmetric; write P = (P + P') / 2"
+    return (
+        f"the covariance is not symmetric: row {i + 1}, column {j + 1} holds {P[row, i, j]:.6g}, but row {j + 1}, "
+        f"column {i + 1} {P[row, j, i]:.6g}. That is more than rounding: write all entries of P in their order"
+    )
 
 
 def longest_start(tracks: Sequence[Track]) -> int:
@@ -258,7 +277,7 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
     elif kind[end] == Validity.NOT_FINITE:
         reason = "covariance is not finite"
     else:
-        reason = "covariance is not positive definite"
+        reason = INDEFINITE
     return min(start, end), end, reason
 
 
@@ -385,7 +404,14 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     names = np.array(axes)
     singular = f"{file}: the covariance is singular in every step"
     if not none.any():
-        return f"{singular}; write only the states that the filter estimates by themselves"
+        scale = np.sqrt(variances)
+        ranks = np.linalg.matrix_rank(P / (scale[:, :, None] * scale[:, None, :]), DEFICIENT, hermitian=True)
+        rank = int(np.median(ranks))
+        return (
+            f"{singular}: its rank is {rank} of {len(names)}. Of an ensemble of {rank + 1} members, judge far fewer "
+            "components than members at a time; where states follow from others, as in a quaternion, write those that "
+            "the filter estimates by themselves"
+        )
     singular += f" (variance zero: {', '.join(names[none])})"
     missing = none & ~still
     idle = ~none & still
@@ -398,6 +424,13 @@ def _singular(file: str, tracks: Sequence[Track], axes: tuple[str, ...]) -> str:
     if not still.all():
         unused = none | idle
     left = ",".join(names[~unused])
+    if missing.any():
+        size = short(float(np.sqrt(np.nanmean(np.square(errors[:, missing])))))
+        return (
+            f"{singular}; errors of {', '.join(names[missing])} are not zero ({size} RMS), so the covariance is too "
+            "small without bound: state the variance that the filter has. "
+            f"--axes {left} for a trajectory, --state {left} for a table, judges the rest alone"
+        )
     return (
         f"{singular}; judge only what the filter estimates: --axes {left} for a trajectory, --state {left} for a table"
     )

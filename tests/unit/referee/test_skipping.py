@@ -10,7 +10,10 @@ from numpy.testing import assert_array_equal
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.diagnostics import Record
+from consistency.diagnostics import Record, Settings
+from consistency.referee.diagnostics.judging.fault_location import until
+from consistency.referee.diagnostics.questions.anees_band import simultaneous_band
+from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
@@ -275,6 +278,16 @@ def test_no_hint_where_a_fault_remains(rng):
         verdict = verdict_on(error, false_alarm=SURE)
         assert verdict.faults
         assert verdict.location.until is None
+
+
+def test_first_steps_that_are_right_carry_no_fault(rng):
+    """Errors of the first step are 1 but for 3 %, those of the others x1.2; no step leaves the band."""
+    error = independent(rng, 200, 60, 3)
+    error *= np.sqrt(3.0 * np.r_[0.97, np.full(59, 1.2)] / np.square(error).sum(axis=-1).mean(axis=0))[:, None]
+    sample = sample_of(Record("f", error, identities(error)), Settings())
+    inside = simultaneous_band(sample.nees / 1.2, 3, SURE)
+    assert not inside.outside.any()
+    assert until(sample, inside, 1.5) is None
 
 
 def test_no_start_to_skip_is_more_than_half(rng):

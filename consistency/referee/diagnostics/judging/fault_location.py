@@ -41,7 +41,8 @@ def location_of(sample: Sample, band: Band, faults: set[str], ordered: bool, det
             first_step = first_outside
             if ordered:
                 lasting = _is_lasting(sample, band, first)
-            if lasting and _absent_before(sample, first, band.above[first]):
+            before, after = slice(first), slice(first, None)
+            if lasting and _is_absent(sample.nees, sample.dof, before, after, 1.0 - CONFIDENCE):
                 since = first_step
     if ordered and faults & {*SCALE, *BIAS}:
         stretch = _stretch(sample, detect)
@@ -76,23 +77,12 @@ def _is_lasting(sample: Sample, band: Band, first: int) -> bool:
     return bool(beyond[np.isfinite(curve)].mean() > 0.5)
 
 
-def _absent_before(sample: Sample, first: int, above: bool) -> bool:
-    """Whether the steps before ``first`` are shown to have less than half of the fault, on the logarithm.
-
-    One-sided Student's t of the log mean before, with the standard error of the runs.
-    """
-    early = sample.means(slice(0, first))
-    late = sample.means(slice(first, None))
-    if len(early) < FEWEST or not early.mean() > 0 or not late.mean() > 0:
-        return False
-    log_early = np.log(early.mean())
-    log_late = np.log(late.mean())
-    if not above:
-        log_early = -log_early
-        log_late = -log_late
-    error = float(early.std(ddof=1) / (early.mean() * np.sqrt(len(early))))
-    upper = log_early + float(distributions.t.isf(1.0 - CONFIDENCE, len(early) - 1)) * error
-    return bool(upper < 0.5 * log_late)
+def _is_absent(nees: Array, dof: int, rest: slice, inside: slice, rate: float) -> bool:
+    """Whether steps of the ``rest`` are shown to have less than half of the fault ``inside``; nees (runs, steps)."""
+    means, of_rest = run_means(nees[:, rest])
+    within, of_inside = run_means(nees[:, inside])
+    both = (of_rest > 0) & (of_inside > 0)
+    return bool(both.sum() >= FEWEST and _less_than_half(means[both] / dof, within[both] / dof, rate))
 
 
 def until(sample: Sample, band: Band, detect: float, stretch: slice | None = None) -> Until | None:
@@ -223,29 +213,17 @@ def _end_of(sample: Sample, band: Band, detect: float, stretch: slice | None) ->
     for nees, other in zip(halves, halves[::-1], strict=True):
         ends = _likeliest_stretch(other, sample.dof, detect)
         assert ends is not None
-        for rest in (nees[:, : ends.start], nees[:, ends.stop :]):
-            if not np.isfinite(rest).any():
-                continue
-            means, of_rest = run_means(rest)
-            inside, of_stretch = run_means(nees[:, ends])
-            both = (of_rest > 0) & (of_stretch > 0)
-            if both.sum() < FEWEST or not _less_than_half(means[both] / sample.dof, inside[both] / sample.dof, SURE):
+        for rest in (slice(ends.start), slice(ends.stop, None)):
+            if np.isfinite(nees[:, rest]).any() and not _is_absent(nees, sample.dof, rest, ends, SURE):
                 return None
     if band.outside[: stretch.start].any() or band.outside[stretch.stop :].any():
         return None
     ratio = ratio_interval(sample.means(stretch), sample.dof, CONFIDENCE)
-    others = ratio_interval(_means_beside(sample, stretch), sample.dof, CONFIDENCE)
+    means, counts = run_means(np.delete(sample.nees, stretch, axis=1))
+    others = ratio_interval(means[counts > 0] / sample.dof, sample.dof, CONFIDENCE)
     if not _is_right(others, detect) or ratio.holds(1.0):
         return None
     return Until(stretch.stop, ratio.value, others)
-
-
-def _means_beside(sample: Sample, stretch: slice) -> Array:
-    """Mean NEES over dof of each run that has steps before or after a stretch, over these, (runs,)."""
-    means, counts = np.stack([run_means(sample.nees[:, : stretch.start]), run_means(sample.nees[:, stretch.stop :])], 1)
-    count = counts.sum(axis=0)
-    total = np.where(counts > 0, means * counts, 0.0).sum(axis=0)
-    return np.asarray(total[count > 0] / count[count > 0] / sample.dof)
 
 
 # --- first steps, and axes ---------------------------------------------------------------------------

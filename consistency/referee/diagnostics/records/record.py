@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.groups_by_column import Groups
     from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped
 
+INDEFINITE = "covariance is not positive definite"  # why a run failed
+
 
 @dataclass(frozen=True)
 class JointNees:
@@ -290,4 +292,6 @@ def each_alone(record: Record) -> Record:
     if record.error is None:
         raise ValueError(f"{record.name}: has no errors")
     n = record.error.shape[-1]
-    return replace(record, parts=tuple((i,) for i in range(n)) if n > 1 else ())
+    reasons = [f.reason.replace(INDEFINITE, "a standard deviation is not above 0") for f in record.failures]
+    failures = tuple(replace(f, reason=reason) for f, reason in zip(record.failures, reasons, strict=True))
+    return replace(record, failures=failures, parts=tuple((i,) for i in range(n)) if n > 1 else ())

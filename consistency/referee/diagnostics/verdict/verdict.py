@@ -82,41 +82,22 @@ class Findings:
     def consistent(self) -> bool:
         return self.status == "consistent"
 
-    def place(self, step: int) -> str:
-        """Name of step 1..T: "step 3 (0.3 s)", or "landmark 17" where landmarks stand in the place of steps.
+    def place(self, step: int, last: int | None = None) -> str:
+        """Name of a step, 1..T, or of several: "step 3 (0.3 s)", "steps 3 to 9 (0.3 to 0.9 s)", "landmark 17" of a map.
 
         Times of a clock that counts from long before are told from the first one on.
         """
         if self.landmarks is not None:
             return f"landmark {self.landmarks[step - 1]}"
-        time = self._time(step)
-        if not time:
-            return f"step {step}"
-        return f"step {step} ({time} s{self._after_start})"
-
-    def places_between(self, first: int, last: int) -> str:
-        """Name of steps 1..T: "steps 21 to 40 (2.1 to 4 s)", or that of the one step."""
-        if first == last:
-            return self.place(first)
-        times = self._time(first), self._time(last)
-        if not all(times):
-            return f"steps {first} to {last}"
-        return f"steps {first} to {last} ({' to '.join(times)} s{self._after_start})"
-
-    def _time(self, step: int) -> str:
-        """Time of step 1..T in s, after the first one where that is of a clock; '' where it is not known."""
-        if self.times is None or not np.isfinite(self.times[step - 1]):
-            return ""
-        if not self._after_start:
-            return f"{self.times[step - 1]:.12g}"
-        return f"{round(self.times[step - 1] - np.nanmin(self.times), MICROSECOND):.12g}"
-
-    @property
-    def _after_start(self) -> str:
-        """Words behind a time: " after the start" where a clock counts from long before, as that of Unix or GPS."""
-        if self.times is None or not np.nanmin(self.times) > CLOCK:
-            return ""
-        return " after the start"
+        ends = [step] if last in (None, step) else [step, last or step]
+        text = f"step{'s' * (len(ends) - 1)} {' to '.join(map(str, ends))}"
+        if self.times is None or not np.isfinite(times := self.times[np.array(ends) - 1]).all():
+            return text
+        after = ""
+        if np.nanmin(self.times) > CLOCK:
+            times = np.round(times - np.nanmin(self.times), MICROSECOND)
+            after = " after the start"
+        return f"{text} ({' to '.join(f'{time:.12g}' for time in times)} s{after})"
 
     def run_name(self, run: int) -> str:
         """Name of a run: "run 3 (est/3.csv)", or "window 3"."""

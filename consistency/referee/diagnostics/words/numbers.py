@@ -69,7 +69,7 @@ def since_text(v: Findings) -> str:
         return ""
     if where.until is None:
         return f" since {v.place(where.since)}"
-    return f" in {v.places_between(where.since, where.until.step)}"
+    return f" in {v.place(where.since, where.until.step)}"
 
 
 def p_text(p: float) -> str:

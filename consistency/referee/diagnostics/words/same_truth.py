@@ -23,7 +23,6 @@ def same_truth(record: Record, found: Findings) -> list[str]:
     where = found.location
     if record.path is None or where is None or where.first_outside is None or len(record.path) < FEWEST:
         return []
-    assert record.error is not None
     assert record.nees is not None
     assert found.scale is not None
     step = int(np.argmax(found.scale.alive > 0))

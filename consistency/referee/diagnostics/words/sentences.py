@@ -169,7 +169,7 @@ def _first_steps(v: Findings) -> list[str]:
         return []
     until = v.location.until
     if v.location.since is not None:
-        where = v.places_between(v.location.since, until.step)
+        where = v.place(v.location.since, until.step)
         return [f"the fault is in {where} only; in the others the covariance ratio is {ratio_text(until.late)}"]
     where = "the first step"
     if until.step > 1:

@@ -2,7 +2,7 @@
 
     python benchmarks/hints.py                # 1,200 honest logs, 20 logs a cell
     python benchmarks/hints.py --logs 200 --cells 5
-    python benchmarks/hints.py --logs 0 --cells 0 --gross 10   # 10 kinds of mix-ups x 3 scales x 10 logs
+    python benchmarks/hints.py --logs 0 --cells 0 --gross 10   # 13 kinds of mix-ups x 3 scales x 10 logs
 
 A mix-up is made worse step by step; the first column has the smallest factor (of the variance of one axis to that of
 another, or of a variance to 1 in its unit) from which on at least 9 of 10 logs are told so. Honest logs are of filters
@@ -11,10 +11,12 @@ tails, a drift. Several kinds of state, sizes, units, numbers of runs, and corre
 
 Gross mix-ups are of logs of all these sizes and correlations, of a filter that is right, or whose covariance is 4 times
 too large or too small: only draws count whose NEES falls by 10 or more with the mix-up undone. Slow logs are single
-drifts whose covariance is a number that nobody estimated.
+drifts whose covariance is a number that nobody estimated. Plain faults are factors of 2 to 30 on errors or deviations:
+at the start, in the middle, in some runs, of one axis or at random; and drifts and biases as large. Their covariances
+have any size, shape and course.
 
-Exit status 1 if more than 6 of 1,200 honest logs, or of the slow ones, get a hint (as large a share of another number),
-or if fewer than 80 % of a kind of gross mix-up, or 90 % of all, are named.
+Exit status 1 if more than 6 of 1,200 honest logs, or of the slow ones, or 4 of 400 plain faults get a hint (as large a
+share of another number), or if fewer than 80 % of a kind of gross mix-up, or 90 % of all, are named.
 """
 
 from __future__ import annotations
@@ -41,10 +43,13 @@ AXES = {
     "spatial": ("x", "y", "z", "roll", "pitch", "yaw"), "planar": ("x", "y", "heading"),
     "vector": ("a", "b", "c", "d"), "scalar": ("a",),
 }  # fmt: skip
+STATES = list(AXES)  # of logs without a mix-up
+AXES["place"] = ("x", "y", "z")
 SIZES = ((1, 200), (1, 1500), (5, 100), (20, 50), (40, 30))  # runs, steps
 MEMORY = (0.0, 0.5, 0.9, 0.98, 0.999)
 WRONG = ("right", "all", "axis", "bias", "tails", "drift")
 PROMISE = 6 / 1200
+OF_PLAIN = 4 / 400
 SPREAD = 4.0  # of variances among axes of one kind, at most, where a log does not say otherwise
 Mess = Callable[[Poses], Poses]
 
@@ -126,7 +131,7 @@ def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Ar
         truth[:, 2] = wrap(truth[:, 2])
     else:
         manifold = "vector"
-        own = np.cumsum(rng.normal(size=(steps, n)), axis=0)
+        own = at if kind == "place" else np.cumsum(rng.normal(size=(steps, n)), axis=0)
         truth = own + e
     if convention == "left":
         truth = vectors(matrices(own) @ motions(e))
@@ -150,10 +155,101 @@ def motions(twists: Array) -> Array:
 
 def honest(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
     """What is wrong with a log, and the hints that it gets."""
-    kind, wrong = list(AXES)[number % len(AXES)], WRONG[number // len(AXES) % len(WRONG)]
+    kind, wrong = STATES[number % len(STATES)], WRONG[number // len(STATES) % len(WRONG)]
     runs, steps = SIZES[rng.integers(len(SIZES))]
     poses = log(rng, kind, runs, steps, MEMORY[rng.integers(len(MEMORY))], wrong)
     return f"{kind}, {wrong}", hints("est", AXES[kind], poses)
+
+
+# --- plain faults -----------------------------------------------------------------------------------
+
+PLAIN = ("start", "middle", "drift", "bias", "scale", "axis", "outliers", "runs")
+COURSES = ("constant", "growing", "two qualities", "wandering", "turning")
+MOST_WRONG = 30.0  # of errors, or of standard deviations
+
+
+def plain(rng: np.random.Generator, number: int) -> tuple[str, list[str]]:
+    """The fault of a filter whose files are not mixed up, and the hints that it gets."""
+    kind = STATES[rng.integers(len(STATES))]
+    n = len(AXES[kind])
+    runs, steps = SIZES[rng.integers(len(SIZES))]
+    convention = {"spatial": "so3", "planar": "so2"}.get(kind, "vector")
+    P = stated(rng, kind, steps)
+    L = np.linalg.cholesky(P)
+    wrong = PLAIN[number % len(PLAIN)]
+    rho = (0.0, 0.0, 0.5, 0.9)[rng.integers(4)]
+    factor = np.exp(rng.uniform(np.log(2.0), np.log(MOST_WRONG)))
+    factors = factor_of(rng, wrong, runs, steps, n, factor)
+    of_P = wrong not in ("drift", "bias") and rng.random() < 0.5
+    if of_P and rng.random() < 0.3:
+        factors = 1.0 / factors
+    offset = np.zeros(n)
+    if wrong == "bias":
+        offset = rng.normal(size=n) * factor / 3.0
+        factors = np.ones_like(factors)
+    found = []
+    for scale in factors:
+        e = np.einsum("kij,kj->ki", L, noise(rng, steps, n, rho, False))
+        e += offset * np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        own = P
+        if of_P:
+            own = P / (scale[:, :, None] * scale[:, None, :])
+        else:
+            e = e * scale
+        found.append(run_of(rng, kind, convention, e, own))
+    return f"{kind}, {wrong}{' of P' * of_P}", hints("est", AXES[kind], found)
+
+
+def stated(rng: np.random.Generator, kind: str, steps: int) -> Array:
+    """Covariances (steps, n, n) of any size and shape: alike or unlike axes, correlated or not, in any course."""
+    n = len(AXES[kind])
+    near_one = rng.random() < 0.5
+    sigma = np.full(n, 10.0 ** (rng.uniform(-0.35, 0.35) if near_one else rng.uniform(-3.0, 1.5)))
+    shape = max(int(rng.integers(-2, 3)), 0)
+    if kind in ("spatial", "planar"):
+        sigma[{"spatial": 3, "planar": 2}[kind] :] = 10.0 ** rng.uniform(-3.0, -1.0)
+    if shape:
+        sigma = sigma * np.exp(rng.uniform(-1.5, 1.5, n))
+    P = covariance(rng, sigma, shape == 2)
+    time = np.linspace(0.0, 1.0, steps)
+    course = COURSES[max(int(rng.integers(-2, len(COURSES))), 0)]
+    size = np.ones(steps)
+    if course == "growing":
+        size = 0.01 + time
+    if course == "two qualities":
+        size = np.where(np.sin(rng.uniform(10.0, 60.0) * time) > rng.uniform(-0.8, 0.8), 1.0, 10.0 ** rng.uniform(0, 2))
+    if course == "wandering":
+        size = np.exp(np.cumsum(rng.normal(size=steps)) * 2.0 / np.sqrt(steps))
+    if course == "turning" and n > 1:
+        angles = rng.uniform(1.0, 9.0) * time
+        turn = np.tile(np.eye(n), (steps, 1, 1))
+        turn[:, :2, :2] = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix()[:, :2, :2]
+        return np.asarray(turn @ P @ np.swapaxes(turn, 1, 2))
+    return np.asarray(P * size[:, None, None])
+
+
+def factor_of(rng: np.random.Generator, wrong: str, runs: int, steps: int, n: int, factor: float) -> Array:
+    """Factors (runs, steps, n) on errors, where the fault is."""
+    out = np.ones((runs, steps, n))
+    part = np.ones(n, bool)
+    if rng.random() < 0.3 or wrong == "axis":
+        part = rng.permutation(n) == 0
+    begin, end = 0, steps
+    if wrong == "start":
+        end = int(np.ceil(rng.uniform(0.02, 0.5) * steps))
+    if wrong == "middle":
+        begin, end = np.sort(rng.integers(0, steps + 1, 2))
+    where = np.zeros((runs, steps), bool)
+    where[:, begin:end] = True
+    if wrong == "runs":
+        where &= (rng.random(runs) < rng.uniform(0.05, 0.5))[:, None]
+    if wrong == "outliers":
+        where = rng.random((runs, steps)) < rng.uniform(0.005, 0.2)
+    strength = np.full((runs, steps), factor)
+    if wrong == "drift":
+        strength = np.tile(np.geomspace(1.0, factor, steps), (runs, 1))
+    out[where[:, :, None] & part] = (strength[:, :, None] * part)[where[:, :, None] & part]
+    return out
 
 
 # --- mix-ups ----------------------------------------------------------------------------------------
@@ -281,6 +377,49 @@ def heading_degrees(p: Poses) -> Poses:
     return replace(p, estimate=p.estimate * [1.0, 1.0, 180.0 / np.pi])
 
 
+def correlations(p: Poses) -> Poses:
+    """Deviations on the diagonal, correlations beside them."""
+    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
+    R = p.covariance / (sigma[:, :, None] * sigma[:, None, :])
+    return replace(p, covariance=np.where(np.eye(sigma.shape[1]) > 0, sigma[:, :, None], R))
+
+
+def turned(axes: Callable[[Poses], Array]) -> Mess:
+    """Covariances of positions in other axes, the columns of matrices (steps, d, d)."""
+
+    def mess(p: Poses) -> Poses:
+        R = axes(p)
+        T = np.tile(np.eye(p.covariance.shape[-1]), (len(R), 1, 1))
+        T[:, : R.shape[1], : R.shape[1]] = np.swapaxes(R, 1, 2)
+        return replace(p, covariance=T @ p.covariance @ np.swapaxes(T, 1, 2))
+
+    return mess
+
+
+def along(p: Poses) -> Array:
+    """Along the true path over ground, to its left, and up."""
+    velocity = np.gradient(p.truth[:, :3], axis=0) * [1.0, 1.0, 0.0]
+    forward = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
+    return np.stack([forward, np.cross(up, forward), up], axis=-1)
+
+
+def orbital(p: Poses) -> Array:
+    """Along the radius, the track and the normal of both."""
+    radius = p.truth[:, :3] / np.linalg.norm(p.truth[:, :3], axis=1, keepdims=True)
+    normal = np.cross(radius, np.gradient(p.truth[:, :3], axis=0))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.stack([radius, np.cross(normal, radius), normal], axis=-1)
+
+
+def twice_the_heading(p: Poses) -> Array:
+    """What is turned by -heading is right when it is turned by twice the heading."""
+    heading = p.estimate[:, 2]
+    if p.manifold == "spatial":
+        heading = Rotation.from_quat(p.estimate[:, 3:]).as_euler("ZYX")[:, 0]
+    return Rotation.from_rotvec(2.0 * heading[:, None] * [0.0, 0.0, 1.0]).as_matrix()[:, :2, :2]
+
+
 def unlike(rng: np.random.Generator, kind: str) -> Array:
     """Standard deviations of which those of a block differ by up to a factor of 30, as along and across the way."""
     factors = np.exp(rng.uniform(-1.0, 1.0, len(AXES[kind])) * 0.5 * np.log(30.0))
@@ -325,6 +464,18 @@ GROSS: dict[str, list[tuple[str, str | None, Callable[[np.random.Generator, str]
     "information, axes unlike": [
         (kind, None, sizes, information, ("information",)) for kind in ("spatial", "planar", "vector")
     ],
+    "rotations of P reordered": [
+        ("spatial", None, unlike, reordered([0, 1, 2, 5, 4, 3]), ("the rotations", "yaw, pitch, roll")),
+        ("spatial", None, unlike, reordered([0, 1, 2, 4, 3, 5]), ("the rotations", "pitch, roll, yaw")),
+    ],
+    "P along the motion": [
+        ("place", None, unlike, turned(along), ("along and across the motion",)),
+        ("place", None, unlike, turned(orbital), ("radius, track and normal",)),
+    ],
+    "P turned by -heading": [
+        ("planar", None, unlike, turned(twice_the_heading), ("negative heading",)),
+        ("spatial", None, unlike, turned(twice_the_heading), ("negative heading",)),
+    ],
 }  # fmt: skip
 
 
@@ -352,8 +503,11 @@ def gross(rng: np.random.Generator, name: str, number: int, scale: float) -> tup
 
 
 def median_nees(runs: list[Poses]) -> float:
+    """The median, infinite where a covariance is not positive definite."""
     found = []
     for p in runs:
+        if (np.linalg.eigvalsh(p.covariance) <= 0).any():
+            return np.inf
         with np.errstate(all="ignore"):
             found.append(np.einsum("ki,kij,kj->k", e := p.errors(), np.linalg.inv(p.covariance), e))
     return float(np.median(np.concatenate(found)))
@@ -361,7 +515,7 @@ def median_nees(runs: list[Poses]) -> float:
 
 def slow(rng: np.random.Generator, number: int) -> list[str]:
     """The hints of a single drifting log, whose covariance is a constant number of its components."""
-    kind = list(AXES)[number % len(AXES)]
+    kind = STATES[number % len(STATES)]
     n, steps = len(AXES[kind]), int(rng.integers(200, 2000))
     e = np.cumsum(rng.normal(size=(steps, n)), axis=0) * sizes(rng, kind) / np.sqrt(steps)
     P = np.tile(10.0 ** rng.uniform(-6.0, 3.0) * np.eye(n), (steps, 1, 1))
@@ -383,7 +537,7 @@ def print_gross(seed: int, logs: int) -> bool:
                     print(f"  {name}, P x{scale:g}: {said[0] if said else 'no hint'}", flush=True)
         shares.append(sum(found) / (3 * logs))
         print(f"{name:<36} right {found[0]}, P/4 {found[1]}, Px4 {found[2]} of {logs} each", flush=True)
-    print(f"gross mix-ups named: {100 * np.mean(shares):.1f} % of {30 * logs}")
+    print(f"gross mix-ups named: {100 * np.mean(shares):.1f} % of {3 * len(GROSS) * logs}")
     return min(shares) >= 0.8 and float(np.mean(shares)) >= 0.9
 
 
@@ -392,13 +546,14 @@ def main() -> int:
         __doc__.splitlines()[0] if __doc__ else "",
         logs=(1200, "Honest logs."),
         cells=(20, "Logs of each mix-up and factor; 0 for none."),
+        plain=(400, "Logs with a plain fault of any size."),
         gross=(10, "Logs of each gross mix-up and scale; 0 for none."),
         slow=(200, "Slow logs."),
         seed=(5, None),
     )
     for number, name in enumerate(MIXED if given.cells else ()):
         print(f"{name:<36} {smallest(np.random.default_rng((given.seed, number)), name, given.cells)}", flush=True)
-    found: dict[str, int] = dict.fromkeys((f"{k}, {w}" for k, w in itertools.product(AXES, WRONG)), 0)
+    found: dict[str, int] = dict.fromkeys((f"{k}, {w}" for k, w in itertools.product(STATES, WRONG)), 0)
     for number in range(given.logs):
         label, said = honest(np.random.default_rng((given.seed, 99, number)), number)
         found[label] += bool(said)
@@ -406,6 +561,13 @@ def main() -> int:
             print(f"  honest ({label}): {hint}", flush=True)
     total = sum(found.values())
     print(f"honest logs with a hint: {total} of {given.logs}")
+    plainly = 0
+    for number in range(given.plain):
+        label, said = plain(np.random.default_rng((given.seed, 97, number)), number)
+        plainly += bool(said)
+        for hint in said:
+            print(f"  plain ({label}): {hint}", flush=True)
+    print(f"plain faults with a hint: {plainly} of {given.plain}")
     drifts = [
         hint for number in range(given.slow) for hint in slow(np.random.default_rng((given.seed, 98, number)), number)
     ]
@@ -413,7 +575,8 @@ def main() -> int:
         print(f"  slow: {hint}", flush=True)
     print(f"slow logs with a hint: {len(drifts)} of {given.slow}")
     enough = not given.gross or print_gross(given.seed, given.gross)
-    return int(total > PROMISE * given.logs or len(drifts) > PROMISE * given.slow or not enough)
+    many = total > PROMISE * given.logs or plainly > OF_PLAIN * given.plain or len(drifts) > PROMISE * given.slow
+    return int(many or not enough)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from consistency.referee.diagnostics.words.sentences import (
     reasons,
     sentences_of_conventions,
 )
+from consistency.referee.diagnostics.words.stated_level import level_causes
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
@@ -115,7 +116,7 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
     left_out = set(found.left_out_steps)
     if judged.align:
         left_out.update(judged.left_out_steps)
-    causes = (*judged.causes, *_causes_of_innovations(judged, found))
+    causes = (*judged.causes, *_causes_of_innovations(judged, found)) or tuple(level_causes(found))
     return _verdict(
         found,
         [sentence, *figures, *causes, *other_ways(found.status, judged)],

@@ -29,7 +29,7 @@ from consistency.referee.readers.mix_ups import hints as readers_hints
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess
 from consistency.referee.readers.mix_ups.known_worlds import _ned
-from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned
+from consistency.referee.readers.mix_ups.reading_fit import COST, FACTOR, PIECES, SMALL, fit_of, thinned
 from consistency.referee.readers.pipeline.relative_motions import causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
@@ -302,6 +302,24 @@ def test_simple_faults_explain_what_they_make():
     assert fit(w, P=P).likelihood == pytest.approx(-1.5 - 0.5 * np.log(np.linalg.det(P)), rel=1e-3)
 
 
+@pytest.mark.parametrize("where", ["steps", "runs", "size"])
+def test_faults_in_some_estimates_explain_what_they_make(where):
+    """Errors 30 times too large in half of the steps or runs; a covariance whose changes of size mean nothing."""
+    rng = np.random.default_rng(10)
+    factor = np.ones((20, 100, 1))
+    stated = np.ones((20, 100))
+    if where == "size":
+        stated = np.exp(rng.uniform(-2.0, 2.0, (20, 100)))
+        stated /= np.exp(np.log(stated).mean())
+    else:
+        factor[(slice(None), slice(50, None)) if where == "steps" else slice(3, 13)] = 30.0
+    e = factor * rng.normal(size=(20, 100, 2))
+    found = fit_of([(error, P[:, None, None] * np.eye(2)) for error, P in zip(e, stated, strict=True)])
+    assert found is not None
+    true = -1.0 - np.log(factor**2).mean()
+    assert true - COST * PIECES / found.size - 0.06 < found.simple() < true + 0.06
+
+
 def test_what_is_right_and_what_is_not():
     """Each part of it: scale, an axis, the mean, correlations, the median; a right one is refused once in 1,000."""
     rng = np.random.default_rng(9)
@@ -309,6 +327,9 @@ def test_what_is_right_and_what_is_not():
     w = np.linalg.solve(np.linalg.cholesky(np.cov(w.T)), (w - w.mean(axis=0)).T).T
     assert fit(w).right(False)
     assert fit(w).is_shown()
+    assert fit(w * 3.0).is_shown(1.0)
+    assert fit(w / 3.0).is_shown(1.0)
+    assert not fit(w * 4.0).is_shown(1.0)
     for factor in (1.2, 1.0 / 1.2):  # is right but for the factor that all share
         assert fit(w * factor).right(False)
         assert not fit(w * factor).is_shown()
@@ -385,6 +406,204 @@ def test_cross_terms_that_are_nearly_singular_are_named_with_their_direction(rng
     assert "nearly singular in the direction +1.00 x -1.00 y" in said or "direction -1.00 x +1.00 y" in said
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_nearly_singular_direction_that_turns_is_named_as_that(n, rng):
+    """One direction of the plane is known 1,000 times too well, another in each step."""
+    angle = rng.uniform(0.4, 1.2, 400) * rng.choice([-1.0, 1.0], 400)
+    P = np.tile(0.04 * np.eye(n), (400, 1, 1))
+    v = np.zeros((400, n))
+    v[:, :2] = np.column_stack([np.cos(angle), np.sin(angle)])
+    P -= (1.0 - 1e-8) * 0.04 * v[:, :, None] * v[:, None, :]
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    run = replace(states(sigma * rng.normal(size=(400, n)), np.eye(n)), covariance=P)
+    (said,) = hints("est", "xyz"[:n], [run])
+    assert "nearly singular in a direction that turns from step to step; look for lost digits" in said
+
+
+# --- plain faults ------------------------------------------------------------------------------------
+
+
+def faulty(rng, kind, var, where, factor_of_error, factor_of_P, of_position=None):
+    """20 runs of 40 steps with white errors of one variance; the fault is in the steps ``where``."""
+    runs = []
+    n = len(world.AXES[kind])
+    for _ in range(20):
+        e = np.sqrt(var) * rng.normal(size=(40, n))
+        P = np.tile(var * np.eye(n), (40, 1, 1))
+        if of_position is not None:
+            e[:, 3:] *= of_position
+            P[:, 3:, 3:] *= of_position**2
+        e[where] *= factor_of_error
+        P[where] *= factor_of_P
+        runs.append(world.run_of(rng, kind, {"spatial": "so3", "planar": "so2"}.get(kind, "vector"), e, P))
+    return runs
+
+
+MIDDLE, LATE, SOME = slice(20, 25), slice(25, None), slice(3, None, 5)
+
+
+@pytest.mark.parametrize(
+    "kind, var, where, of_error, of_P",
+    [
+        ("vector", 0.49, MIDDLE, 1.0, 0.01),
+        ("vector", 2.0, LATE, 1.0, 0.01),
+        ("scalar", 0.25, SOME, 1.0, 0.01),
+        ("scalar", 5.0, MIDDLE, 1.0, 0.1),
+        ("scalar", 1.0, SOME, 3.0, 0.01),
+        ("vector", 0.2, SOME, 1.0, 100.0),
+    ],
+)
+def test_some_steps_whose_covariance_is_wrong_are_no_information_matrix(kind, var, where, of_error, of_P, rng):
+    """The covariance of all other steps is right, whatever is nearer to right in these."""
+    runs = faulty(rng, kind, var, where, of_error, of_P)
+    assert hints("est", world.AXES[kind], runs) == []
+    assert "information" in hints("est", world.AXES[kind], [inverted_and_right(rng, kind, p) for p in runs])[0]
+
+
+def inverted_and_right(rng, kind, p):
+    """A run whose errors have the covariances of another, which are stated as their inverses."""
+    e = np.einsum("kij,kj->ki", np.linalg.cholesky(p.covariance), rng.normal(size=p.covariance.shape[:2]))
+    return world.information(world.run_of(rng, kind, "vector", e, p.covariance))
+
+
+@pytest.mark.parametrize("where, sigma", [(slice(20, 26), 2.0), (slice(0, 8), 4.0), (slice(30, None), 1.0)])
+def test_large_errors_in_some_steps_are_no_millimetres(where, sigma, rng):
+    """On a path of some m, whose positions would vanish in millimetres."""
+    runs = faulty(rng, "spatial", sigma**2, where, 10.0, 1.0, of_position=0.01 / sigma)
+    assert hints("est", SIX, runs) == []
+
+
+@pytest.mark.parametrize("number", range(16))
+def test_plain_faults_get_no_hint(number, rng):
+    """Two of each kind, of any size and shape; at most 1 % of 400 such logs may get one (benchmarks/hints.py)."""
+    assert world.plain(rng, number)[1] == []
+
+
+# --- axes and orders of the covariance ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "order, words",
+    [
+        ([0, 1, 2, 5, 4, 3], "the rotations of the covariance are in the order yaw, pitch, roll"),
+        ([0, 1, 2, 4, 5, 3], "the rotations of the covariance are in the order pitch, yaw, roll"),
+        ([0, 1, 2, 5, 3, 4], "the rotations of the covariance are in the order yaw, roll, pitch"),
+        ([2, 1, 0, 3, 4, 5], "the positions of the covariance are in the order z, y, x"),
+    ],
+)
+def test_one_block_in_another_order_is_named(order, words, rng):
+    (said,) = hints("est", SIX, [world.reordered(order)(p) for p in spatial(rng, plain=True)])
+    own = "roll, pitch, yaw" if "rotations" in words else "x, y, z"
+    assert said.endswith(f"{words}; write them as {own}")
+
+
+@pytest.mark.parametrize(
+    "place, turn",
+    [
+        ([0.1, 0.1, 0.1], [0.01, 0.02, 0.05]),
+        ([0.3, 0.3, 0.3], [0.01, 0.01, 0.06]),
+        ([2.0, 2.0, 2.0], [0.03, 0.001, 0.01]),
+    ],
+)
+def test_orders_that_fit_equally_are_all_said(place, turn, rng):
+    runs = world.log(rng, "spatial", 20, 50, 0.0, sigma=np.array(place + turn), correlated=False)
+    (said,) = hints("est", SIX, [world.reordered([0, 1, 2, 5, 4, 3])(p) for p in runs])
+    assert "the rotations of the covariance are in the order yaw, pitch, roll; write them as" in said
+    assert "(rotations alike)" in said
+    assert said.endswith("(4 causes fit equally)") == (turn[0] == turn[1])
+
+
+TURNED = {
+    "orbital": ("place", world.orbital, "the covariance of x, y, z is along radius, track and normal; turn it into"),
+    "along": ("place", world.along, "the covariance of x, y, z is along and across the motion; turn it into the axes"),
+    "heading": ("planar", world.twice_the_heading, "the covariance of x, y is turned by the negative heading; turn it"),
+    "yaw": ("spatial", world.twice_the_heading, "the covariance of x, y, z is turned by the negative heading"),
+}
+
+
+@pytest.mark.parametrize("name", list(TURNED))
+@pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
+def test_covariances_in_axes_of_the_motion_are_named(name, scale, rng):
+    kind, axes, words = TURNED[name]
+    sigma = np.array([0.05, 0.4, 0.1, 0.01, 0.01, 0.01] if kind == "spatial" else [0.05, 0.4, 0.1])
+    right = [replace(p, covariance=scale * p.covariance) for p in world.log(rng, kind, 10, 60, 0.0, sigma=sigma)]
+    assert not any("covariance of" in said for said in hints("est", world.AXES[kind], right))
+    (said,) = hints("est", world.AXES[kind], [world.turned(axes)(p) for p in right])
+    assert words in said
+
+
+def orbits(rng, sigma, names):
+    """A state of names in any order, whose errors have deviations along radius, track and normal, and that state."""
+    angle = 0.2 * np.arange(60)
+    zero = np.zeros(60)
+    radius = np.column_stack([np.cos(angle), np.sin(angle), zero])
+    track = np.column_stack([-np.sin(angle), np.cos(angle), zero])
+    columns = {"x": 0, "y": 1, "z": 2, "vx": 3, "vy": 4, "vz": 5}
+    order = [columns[name] for name in names]
+    own = np.hstack([7e6 * radius, 7e3 * track])[:, order]
+    R = np.stack([radius, track, np.tile([0.0, 0.0, 1.0], (60, 1))], axis=-1)
+    runs = []
+    for _ in range(10):
+        w = rng.normal(size=(60, 6)) * sigma
+        e = np.hstack([np.einsum("kij,kj->ki", R, w[:, :3]), np.einsum("kij,kj->ki", R, w[:, 3:])])[:, order]
+        P = np.diag(np.square(sigma)[order])
+        runs.append(poses(np.arange(60.0), own - e, P, own, "vector", "vector"))
+    return runs
+
+
+@pytest.mark.parametrize("state", ["x y z", "x y z vx vy vz", "x vx y vy z vz"])
+def test_velocities_are_turned_with_positions(state, rng):
+    names = state.split()
+    sigma = np.array([1.0, 20.0, 0.5, 0.02, 0.001, 0.0005])
+    (said,) = hints("est", names, orbits(rng, sigma, names))
+    assert "the covariance of x, y, z is along radius, track and normal; turn it into the axes of x, y, z" in said
+    assert "too" not in said.partition("about right if")[2]
+
+
+def test_errors_without_places_have_no_motion(rng):
+    """The errors would be a path that each covariance is turned along."""
+    e = rng.normal(size=(400, 3)) * 0.1
+    assert not any("along" in said for said in hints("est", ("x", "y", "z"), [states(e, np.diag([0.01, 1e-4, 1e-4]))]))
+
+
+def test_the_motion_of_a_robot_that_stands_is_that_before(rng):
+    sigma = np.array([0.05, 0.4, 0.1])
+    runs = []
+    for p in world.log(rng, "place", 10, 60, 0.0, sigma=sigma, correlated=False):
+        stays = np.minimum(np.arange(60), 30)
+        error = p.truth - p.estimate
+        R = world.along(replace(p, truth=p.estimate))
+        R = R[np.minimum(np.arange(60), 29)]
+        P = np.swapaxes(R, 1, 2) @ p.covariance @ R
+        at = p.estimate[stays]
+        runs.append(replace(p, truth=at, estimate=at - error, covariance=P))
+    (said,) = hints("est", ("x", "y", "z"), runs)
+    assert "along and across the motion" in said
+
+
+@pytest.mark.parametrize("sigma", [[0.1, 0.02], [3.0, 5.0, 20.0], [0.5, 0.02, 7.0, 0.1, 1.0, 2.0]])
+def test_deviations_with_correlations_are_named(sigma, rng):
+    """Positive definite as a covariance or not."""
+    n = len(sigma)
+    root = np.eye(n) + 0.5 * rng.normal(size=(n, n))
+    R = root @ root.T
+    P = R * np.outer(sigma, sigma) / np.sqrt(np.outer(np.diag(R), np.diag(R)))
+    e = rng.normal(size=(400, n)) @ np.linalg.cholesky(P).T
+    (run,) = [world.correlations(states(e, P))]
+    (said,) = hints("est", [f"e{k}" for k in range(n)], [run])
+    assert "its diagonal holds standard deviations, and correlations are beside them; multiply each" in said
+
+
+@pytest.mark.parametrize("scale", [10.0, 0.1])
+@pytest.mark.parametrize("name", ["turned world", "shifted world", "lever arm"])
+def test_worlds_and_bodies_are_named_beside_a_scale_of_ten(name, scale, rng):
+    make, mess, words = MIXED[name]
+    runs = [replace(mess(p), covariance=scale * mess(p).covariance) for p in make(rng)]
+    (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, runs)
+    assert words in said
+    assert "in all components" in said
+
+
 def test_a_unit_quaternion_with_four_variances_is_named(rng):
     turn = Rotation.random(400, random_state=rng.integers(2**31))
     true = (turn * Rotation.from_rotvec(0.02 * rng.normal(size=(400, 3)))).as_quat()
@@ -427,6 +646,51 @@ def test_causes_are_shown_by_print_and_gate(rng):
     assert cause in verdict._repr_html_()
     with pytest.raises(AssertionError, match="its diagonal holds standard deviations"):
         assert_consistent(errors, P)
+
+
+def sized(rng, factors, runs=40, steps=50):
+    """Errors of components whose mean squares are those numbers, with no chance in it, beside I."""
+    e = rng.normal(size=(runs, steps, len(factors)))
+    e *= np.sqrt(np.array(factors) / np.square(e).mean(axis=(0, 1)))
+    return e, np.broadcast_to(np.eye(len(factors)), (*e.shape, len(factors)))
+
+
+@pytest.mark.parametrize(
+    "factor, n, words",
+    [
+        (1.96**2, 2, "deviations stated at 95 % (1.96 sigma)"),
+        (1.96**2, 3, "deviations stated at 95 % (1.96 sigma)"),
+        (1.96**2, 1, "deviations stated at 95 % (1.96 sigma)"),
+        (4.0, 2, "deviations of 2 sigma"),
+        (4.0, 5, "deviations of 2 sigma"),
+        (2.0 * np.log(2.0), 2, "a CEP in place of deviations (the radius of 50 % in the plane, 1.1774 sigma)"),
+    ],
+)
+def test_a_ratio_of_a_usual_level_is_perhaps_that_level(factor, n, words, rng):
+    (cause,) = judge(*sized(rng, [1.0 / factor] * n)).causes
+    assert words in cause
+    assert cause.startswith("perhaps")
+    assert {3: "is 3.84 ", 4: "4 times", 1: "is 1.386 times"}[int(factor)] in cause
+
+
+@pytest.mark.parametrize(
+    "factors, runs",
+    [
+        ([1 / 2.5] * 2, 40),
+        ([1 / 7.0] * 3, 40),
+        ([1 / 1.386] * 3, 40),  # there is no radius of so many
+        ([1 / 3.84] * 2, 8),  # too few to tell
+        ([1 / 3.84, 1 / 2.5], 40),
+        ([3.84] * 2, 40),
+    ],
+)
+def test_other_ratios_are_no_level(factors, runs, rng):
+    assert judge(*sized(rng, factors, runs)).causes == ()
+
+
+def test_a_cause_that_is_known_leaves_no_perhaps(rng):
+    e, P = sized(rng, [1 / 3.84] * 2)
+    assert judge(Record("est", error=e, covariance=P, causes=("known",))).causes == ("known",)
 
 
 # --- frames -----------------------------------------------------------------------------------------

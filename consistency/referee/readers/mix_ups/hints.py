@@ -13,14 +13,16 @@ from functools import partial
 import numpy as np
 
 from consistency.referee.readers.mix_ups.known import Guess, guesses_of
+from consistency.referee.readers.mix_ups.known_turns import turns_of
 from consistency.referee.readers.mix_ups.known_worlds import worlds_of
-from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, ReadingFit, fit_of, is_same, thinned
+from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, SCALE, ReadingFit, fit_of, is_same, thinned
 from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
 
 WRONG = 1.0  # decades that the NEES is off, from which on causes are named that look like a bias or a drift
 APART = 2.0  # the same of a single component: one run that is off by a constant says little of it
 SAID = 0.2  # decades from which on the scale that remains is stated
+MOST_SAID = 3  # causes
 LIKE = 1.0  # log likelihood by which two causes may differ that are equally likely
 NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
 NEAR = 5.0  # sigmas: an error of an angle, but for whole turns
@@ -69,7 +71,7 @@ def hints(
     worlds = errors_without is None
     if errors_without is None:
         some = thinned(runs, shift)
-        errors_without = partial(_errors_without, some)
+        errors_without = partial(_errors_without, some, [p.errors() for p in some])
         if is_same(some):
             return [
                 f"{name}: the errors are 0 to rounding, so that truth and estimates seem to be the same file or copies "
@@ -81,11 +83,11 @@ def hints(
         return []
     guesses = guesses_of(some, axes, part)
     if worlds:
-        guesses += worlds_of(some)
+        guesses += [*turns_of(some, axes), *worlds_of(some)]
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
-        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
-        return [f"{name}: the covariance is not positive definite, but right if {text}" for text in shown[:1]]
+        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown(SCALE)]
+        return [f"{name}: the covariance is not positive definite, but right if {_either(shown)}"] if shown else []
     cause = _cause(fits, declared)
     if cause is None:
         return []
@@ -94,10 +96,13 @@ def hints(
     return [f"{name}: the NEES{of_axis} is {_times(declared.decades[worst])}, but about right if {cause}"]
 
 
-def _errors_without(runs: Sequence[Poses], change: Change) -> Pairs:
+def _errors_without(runs: Sequence[Poses], errors: Sequence[Array], change: Change) -> Pairs:
+    """Errors after a change, or the ``errors`` before it where it leaves them as they are, and covariances."""
     pairs = []
-    for p in map(change, runs):
-        pairs.append((p.errors(), p.covariance))
+    for p, error in zip(runs, errors, strict=True):
+        other = change(p)
+        same = other.estimate is p.estimate and other.truth is p.truth and other.convention == p.convention
+        pairs.append((error if same else other.errors(), other.covariance))
     return pairs
 
 
@@ -114,12 +119,13 @@ def _cause(fits: Sequence[tuple[Guess, ReadingFit | None]], declared: ReadingFit
     off = np.abs(declared.decades)
     gross = bool(off[0] > WRONG or (off > APART).any())
     candidates = list(_candidates(fits, declared, gross))
-    named = _likeliest(candidates, declared, gross, LEAST_GAIN + np.log(max(len(fits), 1)))
-    if named is not None:
-        rest = named.fit.decades[0]
+    like = _likeliest(candidates, declared, gross, LEAST_GAIN + np.log(max(len(fits), 1)))
+    if like:
+        text = _either([one.guess.text for one in like])
+        rest = like[0].fit.decades[0]
         if abs(rest) <= SAID:
-            return named.guess.text
-        return f"{named.guess.text}; the NEES is then {_times(rest)} in all components"
+            return text
+        return f"{text}; the NEES is then {_times(rest)} in all components"
     for one in candidates:
         if (gross or one.guess.exact) and one.fit.is_shown():
             if one.fit.n != declared.n:
@@ -143,12 +149,12 @@ def _candidates(
         yield Candidate(guess, fit, size, gain)
 
 
-def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Candidate | None:
-    """The likeliest candidate that is right but for a common factor; of like ones the first, and the last at need."""
+def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: bool, bar: float) -> Sequence[Candidate]:
+    """The likeliest candidates that are right but for a common factor, which are equally likely; at need the last."""
     right = []
     at_need = []
     for one in candidates:
-        if one.size * one.gain < bar or not one.fit.right(gross):
+        if one.size * one.gain < bar or not one.fit.right(gross) or not one.fit.is_better(declared):
             continue
         if _status(one.fit) > _status(declared):
             continue
@@ -158,7 +164,15 @@ def _likeliest(candidates: Sequence[Candidate], declared: ReadingFit, gross: boo
             right.append(one)
     right = right or at_need
     most = max((one.gain for one in right), default=0.0)
-    return next((one for one in right if one.size * (most - one.gain) <= LIKE), None)
+    return [one for one in right if one.size * (most - one.gain) <= LIKE]
+
+
+def _either(texts: Sequence[str]) -> str:
+    """Causes between which the errors do not decide, the likelier first."""
+    said = "; or if ".join(texts[:MOST_SAID])
+    if len(texts) > MOST_SAID:
+        said += f" ({len(texts)} causes fit equally)"
+    return said
 
 
 def _status(fit: ReadingFit) -> int:

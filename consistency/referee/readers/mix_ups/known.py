@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +22,8 @@ SWAPS = 8  # and up to which swaps of two are
 DEGREE = np.pi / 180.0
 MILLI = 1e-3
 SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a direction is named
+SAME = 0.9  # share of a direction that is the same in all steps
+WORK = 1e8  # multiplications at most to look for such directions
 UNIT = 1e-3  # lengths of quaternions differ by less from 1
 
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
@@ -47,13 +50,14 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
         return list(_blocks(n))
-    scales = [*_roots(part), *_singular(runs, axes, part)]
+    scales = [*_roots(runs, part), *_singular(runs, axes, part)]
     if kind == "vector":
         covariances = _permuted(axes, len(axes))
         states = _permuted(axes, len(axes), states=True)
         return [*scales, *covariances, *states, *_quaternion_states(runs, axes)]
-    of_covariance = *scales, *_permuted(axes, 3)
+    of_covariance = [*scales, *_permuted(axes, 3)]
     if kind == "spatial":
+        of_covariance = [*scales, *_block_orders(axes), *_permuted(axes, 3)]
         words = "its angles are half angles, those of the vector part of a quaternion; multiply their variances by 4"
         angles = slice(3, 6)
         half = Guess(words, changed(covariance=_times(angles, 2.0)), exact=True)
@@ -116,14 +120,38 @@ def _inverse(poses: Array) -> Array:
 # --- covariances -------------------------------------------------------------------------------------
 
 
-def _roots(part: list[int]) -> Iterator[Guess]:
+def _roots(runs: Sequence[Poses], part: list[int]) -> Iterator[Guess]:
     """Standard deviations, an inverse or a root in the place of the covariance."""
+    beside = _cross_terms(runs, part)
     yield Guess("its diagonal holds standard deviations; square them", changed(covariance=_squared))
+    if beside.any() and (np.abs(beside) <= 1.0).all():
+        words = (
+            "its diagonal holds standard deviations, and correlations are beside them; multiply each correlation by "
+            "the two deviations, and square the diagonal"
+        )
+        yield Guess(words, changed(covariance=_of_correlations))
     inverted = partial(_inverted, part=part)
     yield Guess("it is an information matrix; invert it", changed(covariance=inverted))
     words = "it holds the upper root U of an information matrix U'U; write the inverse of U'U"
     yield Guess(words, changed(covariance=lambda U: inverted(_of_root(U))))
-    yield Guess("it holds the lower root L of the covariance; write L L'", changed(covariance=_of_root))
+    if beside.any():
+        yield Guess("it holds the lower root L of the covariance; write L L'", changed(covariance=_of_root))
+
+
+def _cross_terms(runs: Sequence[Poses], part: list[int]) -> Array:
+    """Numbers beside the diagonals of the rows and columns ``part``, those that are finite, (k,)."""
+    P = np.concatenate([submatrices(p.covariance, part) for p in runs])
+    values = P[:, ~np.eye(len(part), dtype=bool)]
+    return np.asarray(values[np.isfinite(values)])
+
+
+def _of_correlations(P: Array) -> Array:
+    """D R D of matrices with the deviations D on their diagonals and the correlations R beside."""
+    n = P.shape[-1]
+    sigma = np.diagonal(P, axis1=1, axis2=2)
+    R = P.copy()
+    R[:, range(n), range(n)] = 1.0
+    return np.asarray(R * sigma[:, :, None] * sigma[:, None, :])
 
 
 def _squared(P: Array) -> Array:
@@ -175,19 +203,23 @@ def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> It
         return
     sigma = np.sqrt(np.abs(np.diagonal(P, axis1=1, axis2=2)))
     with np.errstate(invalid="ignore", divide="ignore"):
-        correlations = P / sigma[:, :, None] / sigma[:, None, :]
-        R = np.median(correlations, axis=0)
-    if not np.isfinite(R).all():
+        R = P / sigma[:, :, None] / sigma[:, None, :]
+    R = R[finite_rows(R)]
+    R = R[:: math.ceil(max(R.size * len(part) / WORK, 1.0))]
+    if not len(R):
         return
     values, vectors = np.linalg.eigh(R)
-    if values[0] > SINGULAR:
+    if np.median(values[:, 0]) > SINGULAR:
         return
-    v = vectors[:, 0]
-    v = v / v[np.argmax(np.abs(v))]
-    direction = " ".join(f"{v[k]:+.2f} {axes[part[k]]}" for k in np.flatnonzero(np.abs(v) > 0.1))
+    v = vectors[:, :, 0]
+    share, mean = np.linalg.eigh(v.T @ v / len(v))
+    where = "a direction that turns from step to step"
+    if share[-1] > SAME:
+        v = mean[:, -1] / mean[np.argmax(np.abs(mean[:, -1])), -1]
+        direction = " ".join(f"{v[k]:+.2f} {axes[part[k]]}" for k in np.flatnonzero(np.abs(v) > 0.1))
+        where = f"the direction {direction} (in standard deviations)"
     words = (
-        f"its cross terms are left out: it is nearly singular in the direction {direction} (in standard deviations); "
-        "look for lost digits or a correlation of 1"
+        f"its cross terms are left out: it is nearly singular in {where}; look for lost digits or a correlation of 1"
     )
     yield Guess(words, changed(covariance=_without_cross_terms))
 
@@ -252,6 +284,17 @@ def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator
         if states:
             fields["estimate"] = _columns(whole)
         yield Guess(f"{words}; write them as {', '.join(axes[:width])}", changed(**fields))
+
+
+def _block_orders(axes: Sequence[str]) -> Iterator[Guess]:
+    """Components of one block of the covariance of poses in space in another order, the other block being right."""
+    for first, what in ((3, "rotations"), (0, "positions")):
+        same = list(range(6))
+        own = axes[first : first + 3]
+        for order, there in reversed([*_other_orders(own, 3)]):
+            whole = [*same[:first], *(first + i for i in order), *same[first + 3 :]]
+            words = f"the {what} of the covariance are in the order {there}; write them as {', '.join(own)}"
+            yield Guess(words, changed(covariance=_components(whole)))
 
 
 def _positions(width: int) -> Iterator[Guess]:

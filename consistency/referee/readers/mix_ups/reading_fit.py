@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,11 +25,16 @@ NEGLIGIBLE = 1e-3  # of sigma
 NEARLY_ALL = 0.99  # of the estimates
 LEAST = 3  # estimates that show two files to be the same
 RIGHT = 0.4  # decades that components may differ by with the mix-up undone, or more where chance allows it
-SCALE = 1.0  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
+SCALE = 1.3  # decades that all may be off by with the mix-up undone: a filter's own fault beside it
 ENOUGH = 100.0  # independent estimates that show a scale to be the one that a cause makes
 BIAS = 6.0  # standard deviations that a filter is off by without a mix-up
 FACTOR = 6.0  # by which a wrong filter's covariance is off without a mix-up: the table of benchmarks/hints.py has 4
 ANY = 1e8  # the same of a number that stands for all variances
+WIDE = 1e3  # the same of a fault in some steps or runs, or of any size that is rarer
+PIECES = 10  # of the steps, and of the runs, in which a fault may have sizes of its own
+COST = 1.5  # log likelihood of each number that is fitted to such a fault
+RARE = 10.0  # the same of such a fault of one component, which is as rare as one of some 20 mix-ups
+POWERS = (1.0, 0.5, 0.0)  # of the size of the stated covariance: what it varies by may mean nothing
 ODD = 1e-3  # probability that errors with the stated covariance are not taken for such
 GROUPS = {3: ([0, 1],), 6: ([0, 1, 2], [3, 4, 5])}  # position and attitude, of poses
 SMALL = 30  # components up to which all matrices are solved at once, which is slower for larger ones
@@ -107,7 +113,7 @@ class ReadingFit:
     def right(self, roughly: bool) -> bool:
         """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
         if roughly:
-            return bool(abs(self.decades[0]) < SCALE and self._alike().all())
+            return bool(self._alike().all())
         w = self.w / np.sqrt(self.scale)
         pairs = np.triu_indices(self.n, 1)
         products = (w.T @ w / len(w))[pairs]
@@ -119,6 +125,11 @@ class ReadingFit:
         deviances = self.size * np.append(of_axes, np.square(normal))
         return bool((deviances <= limit).all())
 
+    def is_better(self, declared: ReadingFit) -> bool:
+        """Whether the scale is nearly right, and no further off than anything as declared."""
+        off = abs(float(self.decades[0]))
+        return off < min(SCALE, float(np.abs(declared.decades).max()))
+
     def _alike(self) -> Indices:
         """Components whose NEES is off like that of all, within decades or by chance in few estimates, (n,) of bool."""
         within = np.abs(self.decades[1:] - self.decades[0]) < RIGHT
@@ -126,17 +137,23 @@ class ReadingFit:
         chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
         return np.asarray(within | chance)
 
-    def is_shown(self) -> bool:
-        """Whether all is right, the common factor too, with enough independent estimates to show it."""
-        off = self.n * self.size * _deviance(self.scale)
+    def is_shown(self, scale: float = 0.0) -> bool:
+        """Whether enough independent estimates show that all is right, the common factor too, within decades."""
+        factor = 10.0 ** max(abs(float(np.log10(max(self.scale, 1e-300)))) - scale, 0.0)
+        off = self.n * self.size * _deviance(factor if self.scale > 1.0 else 1.0 / factor)
         limit = distributions.chi2.isf(ODD, 1)
         return self.size >= ENOUGH and self.right(False) and bool(off <= limit)
 
     def near(self) -> float:
-        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``."""
+        """Mean log likelihood with the best factor on the covariance, of at most ``SCALE``.
+
+        Pieces of the steps, or of the runs, may have factors of their own beside it.
+        """
         f = _common_factor(self.scale)
         gain = self.scale - self.scale / f - float(np.log(f))
-        return self.likelihood + 0.5 * self.n * gain
+        whole = self.scale - 1.0 - float(np.log(max(self.scale, 1e-300)))
+        of_pieces = self._in_pieces(self._squares([]), 0, POWERS[:1]) - 0.5 * self.n * whole
+        return self.likelihood + 0.5 * self.n * gain + max(of_pieces, 0.0)
 
     def is_off(self) -> bool:
         """Whether another covariance explains the errors better by what a mix-up has to gain at least."""
@@ -155,15 +172,19 @@ class ReadingFit:
 
         That is any factor on the covariance of all components, with one of at most ``FACTOR`` on that of a single one,
         of position or of attitude, or of any size there where one number was written for all variances; or a bias of
-        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``.
+        at most ``BIAS`` standard deviations of each component with a factor within ``SCALE``. Faults in some steps or
+        runs, factors of one component up to ``WIDE``, and covariances whose changes of size mean less than stated
+        cost ``COST`` for each of their numbers; such a wide factor is as rare as a mix-up.
         """
         singles = [[j] for j in range(self.n)] if self.n <= FEW else []
         groups = [[], *singles, *GROUPS.get(self.n, ())]
         constant = self.error.mean(axis=0) / self.sigma
         growing = np.tile(self.own.mean(axis=0), (len(self.own), 1))
-        of_bias = map(self._with_bias, (constant, growing))
-        of_factor = map(self._with_factor, groups)
-        return self.likelihood + max(*of_bias, *of_factor)
+        gains = [self._with_bias(bias) for bias in (constant, growing)]
+        for group in groups:
+            squares = self._squares(group)
+            gains += [self._with_factor(squares, len(group)), self._in_pieces(squares, len(group), POWERS)]
+        return self.likelihood + max(gains)
 
     def _with_bias(self, bias: Array) -> float:
         """Log likelihood that an estimate gains by a bias (K, n), over the standard deviations."""
@@ -174,23 +195,72 @@ class ReadingFit:
         f = _common_factor(after)
         return 0.5 * self.n * (self.scale - after / f - float(np.log(f)))
 
-    def _with_factor(self, group: list[int]) -> float:
-        """Log likelihood that an estimate gains by a factor on some components, beside one on all."""
+    def _with_factor(self, squares: Array, size: int) -> float:
+        """Log likelihood that an estimate gains by a factor on ``size`` components, beside one on all.
+
+        ``squares`` are those of :meth:`_squares`.
+        """
         most = np.log(FACTOR)
         if np.ptp(self.sigma) <= 1e-9 * self.sigma.max():
             most = np.log(ANY)
         f = np.exp(np.linspace(-most, most, 61))
+        mean = squares.mean(axis=0, keepdims=True)
+        return 0.5 * (self.n * (self.scale - 1.0) - float(_least(mean, f, size, self.n)[0]))
+
+    def _in_pieces(self, squares: Array, size: int, powers: Sequence[float]) -> float:
+        """Log likelihood that an estimate gains by such factors in each piece of the steps or of the runs.
+
+        The size of the stated covariance counts by one of the ``powers`` of itself. What the numbers cost is taken off.
+        """
+        f = np.exp(np.linspace(-1.0, 1.0, 61) * np.log(WIDE)) if size else np.ones(1)
+        best = -np.inf
+        for power, pieces in itertools.product(powers, self._pieces):
+            count = np.bincount(pieces)
+            share = count / len(pieces)
+            weighed = squares.T * np.exp((1.0 - power) * self._log_size)
+            means = np.array([np.bincount(pieces, column) for column in weighed]).T / count[:, None]
+            left = float(share @ _least(means, f, size, self.n))
+            fitted = len(count) * (1 + bool(size)) - (power == 1.0)
+            cost = COST * fitted + RARE * bool(size)
+            best = max(best, 0.5 * (self.n * (self.scale - 1.0) - left) - cost / self.size)
+        return best
+
+    def _squares(self, group: list[int]) -> Array:
+        """w'w, w'p and p'p of the whitened errors w and their part p that is of some components, (K, 3)."""
+        if not group:
+            return np.column_stack([self.nees, np.zeros((len(self.nees), 2))])
         of_group = np.zeros_like(self.own)
         of_group[:, group] = self.own[:, group]
         part = _solved(self.factor, of_group)
-        mixed = float((self.w * part).sum(axis=1).mean())
-        alone = float(np.square(part).sum(axis=1).mean())
-        a = f**-0.5 - 1.0
-        total = self.n * self.scale + 2.0 * a * mixed + a**2 * alone
-        after = np.maximum(total, 1e-300) / self.n
-        gains = self.n * (self.scale - 1.0 - np.log(after))
-        gains -= len(group) * np.log(f)
-        return 0.5 * float(gains.max())
+        return np.column_stack([self.nees, (self.w * part).sum(axis=1), np.square(part).sum(axis=1)])
+
+    @cached_property
+    def _log_size(self) -> Array:
+        """log of the n-th root of the determinant of each covariance, (K,), less its mean."""
+        diagonal = np.diagonal(self.factor, axis1=1, axis2=2)
+        size = 2.0 * (np.log(diagonal) + np.log(self.sigma)).mean(axis=1)
+        return np.asarray(size - size.mean())
+
+    @cached_property
+    def _pieces(self) -> list[Indices]:
+        """Where each estimate belongs, (K,) of int: to all, to a piece of its run, to runs of a like NEES."""
+        lengths = [len(w) for w in self.whitened]
+        steps = np.concatenate([np.arange(k) * PIECES // k for k in lengths])
+        rank = np.argsort(np.argsort([np.square(w).mean() for w in self.whitened]))
+        runs = np.repeat(rank * PIECES // len(rank), lengths)
+        pieces = [np.zeros(len(steps), int), steps, runs]
+        return [np.unique(labels, return_inverse=True)[1] for labels in pieces]
+
+
+def _least(squares: Array, f: Array, size: int, n: int) -> Array:
+    """n log of what a common factor leaves beside the best of factors ``f`` on ``size`` components, (B,).
+
+    ``squares`` are means of those of :meth:`ReadingFit._squares`, (B, 3).
+    """
+    a = f**-0.5 - 1.0
+    total = squares[:, :1] + 2.0 * a * squares[:, 1:2] + a**2 * squares[:, 2:]
+    left = n * np.log(np.maximum(total, 1e-300) / n) + size * np.log(f)
+    return np.asarray(left.min(axis=1))
 
 
 def fit_of(runs: Sequence[tuple[Array, Array]]) -> ReadingFit | None:

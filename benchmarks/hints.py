@@ -2,7 +2,7 @@
 
     python benchmarks/hints.py                # 1,200 honest logs, 20 logs a cell
     python benchmarks/hints.py --logs 200 --cells 5
-    python benchmarks/hints.py --logs 0 --cells 0 --gross 10   # 14 kinds of mix-ups x 3 scales x 10 logs
+    python benchmarks/hints.py --logs 0 --cells 0 --gross 10   # 13 kinds of mix-ups x 3 scales x 10 logs
 
 A mix-up is made worse step by step; the first column has the smallest factor (of the variance of one axis to that of
 another, or of a variance to 1 in its unit) from which on at least 9 of 10 logs are told so. Honest logs are of filters
@@ -475,9 +475,6 @@ GROSS: dict[str, list[tuple[str, str | None, Callable[[np.random.Generator, str]
     "P turned by -heading": [
         ("planar", None, unlike, turned(twice_the_heading), ("negative heading",)),
         ("spatial", None, unlike, turned(twice_the_heading), ("negative heading",)),
-    ],
-    "deviations and correlations": [
-        (kind, None, large, correlations, ("correlations are beside",)) for kind in ("spatial", "planar", "vector")
     ],
 }  # fmt: skip
 

@@ -29,7 +29,7 @@ from consistency.referee.readers.mix_ups import hints as readers_hints
 from consistency.referee.readers.mix_ups.hints import hints, turns
 from consistency.referee.readers.mix_ups.known import Guess
 from consistency.referee.readers.mix_ups.known_worlds import _ned
-from consistency.referee.readers.mix_ups.reading_fit import FACTOR, SMALL, fit_of, thinned
+from consistency.referee.readers.mix_ups.reading_fit import COST, FACTOR, PIECES, SMALL, fit_of, thinned
 from consistency.referee.readers.pipeline.relative_motions import causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
@@ -302,6 +302,24 @@ def test_simple_faults_explain_what_they_make():
     assert fit(w, P=P).likelihood == pytest.approx(-1.5 - 0.5 * np.log(np.linalg.det(P)), rel=1e-3)
 
 
+@pytest.mark.parametrize("where", ["steps", "runs", "size"])
+def test_faults_in_some_estimates_explain_what_they_make(where):
+    """Errors 30 times too large in half of the steps or runs; a covariance whose changes of size mean nothing."""
+    rng = np.random.default_rng(10)
+    factor = np.ones((20, 100, 1))
+    stated = np.ones((20, 100))
+    if where == "size":
+        stated = np.exp(rng.uniform(-2.0, 2.0, (20, 100)))
+        stated /= np.exp(np.log(stated).mean())
+    else:
+        factor[(slice(None), slice(50, None)) if where == "steps" else slice(3, 13)] = 30.0
+    e = factor * rng.normal(size=(20, 100, 2))
+    found = fit_of([(error, P[:, None, None] * np.eye(2)) for error, P in zip(e, stated, strict=True)])
+    assert found is not None
+    true = -1.0 - np.log(factor**2).mean()
+    assert true - COST * PIECES / found.size - 0.06 < found.simple() < true + 0.06
+
+
 def test_what_is_right_and_what_is_not():
     """Each part of it: scale, an axis, the mean, correlations, the median; a right one is refused once in 1,000."""
     rng = np.random.default_rng(9)
@@ -309,6 +327,9 @@ def test_what_is_right_and_what_is_not():
     w = np.linalg.solve(np.linalg.cholesky(np.cov(w.T)), (w - w.mean(axis=0)).T).T
     assert fit(w).right(False)
     assert fit(w).is_shown()
+    assert fit(w * 3.0).is_shown(1.0)
+    assert fit(w / 3.0).is_shown(1.0)
+    assert not fit(w * 4.0).is_shown(1.0)
     for factor in (1.2, 1.0 / 1.2):  # is right but for the factor that all share
         assert fit(w * factor).right(False)
         assert not fit(w * factor).is_shown()

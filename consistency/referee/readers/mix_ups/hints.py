@@ -15,7 +15,7 @@ import numpy as np
 from consistency.referee.readers.mix_ups.known import Guess, guesses_of
 from consistency.referee.readers.mix_ups.known_turns import turns_of
 from consistency.referee.readers.mix_ups.known_worlds import worlds_of
-from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, ReadingFit, fit_of, is_same, thinned
+from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, SCALE, ReadingFit, fit_of, is_same, thinned
 from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array
 
@@ -86,7 +86,7 @@ def hints(
         guesses += [*turns_of(some, axes), *worlds_of(some)]
     fits = [(guess, fit_without(guess.change)) for guess in guesses]
     if declared is None:
-        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown()]
+        shown = [guess.text for guess, fit in fits if fit is not None and fit.is_shown(SCALE)]
         return [f"{name}: the covariance is not positive definite, but right if {_either(shown)}"] if shown else []
     cause = _cause(fits, declared)
     if cause is None:

@@ -138,9 +138,10 @@ class ReadingFit:
         chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
         return np.asarray(within | chance)
 
-    def is_shown(self) -> bool:
-        """Whether all is right, the common factor too, with enough independent estimates to show it."""
-        off = self.n * self.size * _deviance(self.scale)
+    def is_shown(self, scale: float = 0.0) -> bool:
+        """Whether enough independent estimates show that all is right, the common factor too, within decades."""
+        factor = 10.0 ** max(abs(float(np.log10(max(self.scale, 1e-300)))) - scale, 0.0)
+        off = self.n * self.size * _deviance(factor if self.scale > 1.0 else 1.0 / factor)
         limit = distributions.chi2.isf(ODD, 1)
         return self.size >= ENOUGH and self.right(False) and bool(off <= limit)
 

@@ -174,12 +174,16 @@ def test_what_never_changes_is_left_out_though_it_is_off(case, dummy, tmp_path):
         assert cs.read(est, truth=truth, axes=["x", "z", "yaw"]).axes == ("x", "z", "yaw")
 
 
-@pytest.mark.parametrize("convention, axes", [("so3", 3), ("right", 4), ("left", 4)])
-def test_a_height_in_tilted_axes_is_not_left_out(convention, axes, tmp_path):
+@pytest.mark.parametrize(
+    "convention, roll, axes", [("so3", 0.2, 3), ("right", 0.2, 4), ("left", 0.2, 4), ("left", 0.0, 3)]
+)
+def test_a_height_in_tilted_axes_is_not_left_out(convention, roll, axes, tmp_path):
     """Of two tilts that differ, errors of a group mix the axes."""
     est, truth = planar(tmp_path, (1e-6,) * 3)
-    moved(est, truth, lambda t, own, true: (tilted(own, 0.2 * ONE, 0.0 * ONE), true))
-    assert len(cs.read(est, truth=truth, error=convention).axes) == axes
+    moved(est, truth, lambda t, own, true: (tilted(own, roll * ONE, 0.0 * ONE), true))
+    record = cs.read(est, truth=truth, error=convention)
+    assert len(record.axes) == axes
+    assert any("not estimated and left out, as by" in note for note in record.notes)
 
 
 MOVES = {  # and which components are still left out

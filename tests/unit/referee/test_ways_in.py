@@ -294,7 +294,6 @@ UNKNOWN = {
     "gga.nmea": ("$GPGGA,1\n", "NMEA"),
     "e.h5": ("\x89HDF", "h5py"),
     "e.bin": ("", "'consistency monitor'"),
-    "e.ulg": ("", "'consistency monitor'"),
     "e.npy": ("", "load it"),
     "e.json": ("{}", "jsonl"),
     "e.xlsx": ("", "save the sheet as .csv"),
@@ -316,7 +315,7 @@ def test_an_unknown_kind_is_refused_with_the_way_in(name, inside, capsys):
     fit = refused(capsys, "fit-covariance", name, "--truth", name, "--span", "1m", "--out", "out")
     assert "numpy.savez" in fit
     assert "estimates=poses" in fit
-    if name not in ("e.ulg", "e.bin"):
+    if name != "e.bin":
         assert "nis=nis, nis_dof=dof" in refused(capsys, "monitor", name, "--innovations", "optimal")
 
 

@@ -207,8 +207,9 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
     of = {}
     for name in innovations:
         if name in variances and not name.startswith("timestamp"):
-            own[name] = np.asarray(innovations[name], float)[rows]
-            of[name] = np.asarray(variances[name], float)[match]
+            with np.errstate(invalid="ignore"):  # of a NaN that signals
+                own[name] = np.asarray(innovations[name], float)[rows]
+                of[name] = np.asarray(variances[name], float)[match]
     return Pairs(np.full(len(t), np.nan) if stands else t[rows], own, of, len(t) + len(other) - 2 * len(rows))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ POSITION, ATTITUDE, STATES = "vehicle_local_position", "vehicle_attitude", "esti
 TRUE = "_groundtruth"
 ERROR_STATES = 25  # states of the EKF2 whose covariance has a rotation vector in the place of a quaternion
 PLACES = (7, 6)  # of the variances of the position, behind those of the attitude and the velocity: of 24 and 25 states
+QUATERNION = ("q[1]", "q[2]", "q[3]", "q[0]")  # x, y, z, w
 NED = [1, 0, 2]  # axes of east, north, up that are north, east and the opposite of down
 WHY = "; north, east, down as PX4 logs them"
 
@@ -78,6 +80,12 @@ def _topic(path: Path, log: Any, name: str, *needed: str) -> Fields:
     return data
 
 
+def _columns(data: Fields, names: Iterable[str]) -> Array:
+    """Numbers of four bytes as floats, (N, columns)."""
+    with np.errstate(invalid="ignore"):  # of a NaN that signals
+        return np.column_stack([data[name].astype(float) for name in names])
+
+
 def _stamps(path: Path, name: str, data: Fields) -> Array:
     """Times of the data of messages, s; those of publication where they are not logged."""
     sample = data.get("timestamp_sample")
@@ -87,13 +95,13 @@ def _stamps(path: Path, name: str, data: Fields) -> Array:
 def _track(path: Path, log: Any, ending: str) -> Track:
     """Positions that are valid, each with the attitude at its time."""
     position = _topic(path, log, POSITION + ending, *"xyz")
-    attitude = _topic(path, log, ATTITUDE + ending, *(f"q[{i}]" for i in range(4)))
+    attitude = _topic(path, log, ATTITUDE + ending, *QUATERNION)
     t, first = np.unique(_stamps(path, POSITION + ending, position), return_index=True)
     at, rows = np.unique(_stamps(path, ATTITUDE + ending, attitude), return_index=True)
-    turns = np.column_stack([np.zeros((len(at), 3)), *(attitude[f"q[{i}]"][rows].astype(float) for i in (1, 2, 3, 0))])
+    turns = np.column_stack([np.zeros((len(at), 3)), _columns(attitude, QUATERNION)[rows]])
     bad = not_unit(turns)[0] | ~finite_rows(turns)
     known = truth_at(t, at[~bad], turns[~bad], "spatial", 0.1) if not bad.all() else None
-    place = np.column_stack([position[axis][first].astype(float) for axis in "xyz"])
+    place = _columns(position, "xyz")[first]
     valid = finite_rows(place)
     for flag in ("xy_valid", "z_valid"):
         valid &= position.get(flag, np.ones(len(t)))[first] != 0
@@ -112,7 +120,7 @@ def _variances(path: Path, own: Track, states: Fields) -> Array:
     t = _stamps(path, STATES, states)
     is_vector = f"states[{ERROR_STATES - 1}]" in states
     first = PLACES[is_vector]
-    P = np.column_stack([states[f"covariances[{i}]"].astype(float) for i in range(first + 3)])
+    P = _columns(states, [f"covariances[{i}]" for i in range(first + 3)])
     if (P < 0).any():
         raise InputError(f"{path}: {STATES} holds a variance below 0 ({P.min():.4g})")
     if is_vector:

@@ -106,7 +106,8 @@ class Guarded:
         return known, info if len(known) else None
 
     def _expected(self, state: GuardedState, observation: Observation, places: Any) -> Info:
-        _, info = self.filter.update(state.inner, Observation(observation.landmarks[places], observation.z[places]))
+        ask = getattr(self.filter, "expected", self.filter.update)
+        _, info = ask(state.inner, Observation(observation.landmarks[places], observation.z[places]))
         if info is None:
             raise TypeError("a guard needs a filter whose update returns Info")
         return info

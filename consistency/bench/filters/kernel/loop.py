@@ -92,8 +92,8 @@ def _insert_new(
         o = offset[label]
         if may_enter(slam.guard, i, o >= 0, watch):
             if o < 0:
-                o = offset[label] = n
-                n += w
+                o = offset[label] = n if o == -1 else -1 - o
+                n = max(n, o + w)
             place(slam.point, slam, State(x, P, o, base, offset), k, label, data.z[i], work)
             insert_error(slam.error, x[:3], x[o : o + w], work.Jp)
             append(slam.covariance, slam, State(x, P, n, base, offset), label, local, work)
@@ -112,7 +112,9 @@ def _step(
     if code > 0:
         return state, code, 0, nis, log_det
     if m > 0:
+        work.used[0] = m
         code, nis, log_det = correct(slam.update, slam, state, data, k, m, has_innovation, local, work)
+        m = work.used[0]
         if code > 0:
             return state, code, 0, nis, log_det
     state = _insert_new(slam, state, data, k, local, work, watch)
@@ -235,9 +237,12 @@ def _settle_new(labels: Indices, n: int, w: int, state: State, home: Indices) ->
         copy(state.offset, home)
         return state.n
     for label in labels:
-        if home[label] < 0 and state.offset[label] >= 0:  # a guard may have kept it out
+        if home[label] == -1 and state.offset[label] >= 0:  # a guard may have kept it out
             home[label] = n
             n += w
+    for label in range(len(home)):  # forgotten in this step, or begun again
+        if (state.offset[label] < -1 and home[label] >= 0) or (state.offset[label] >= 0 and home[label] < -1):
+            home[label] = -1 - home[label]
     return n
 
 

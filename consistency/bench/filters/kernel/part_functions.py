@@ -68,7 +68,7 @@ class State(NamedTuple):
     P: Array  # (>= n, >= n)
     n: int
     base: int  # variables of the base, 0 unless updating is local
-    offset: Indices  # (n_landmarks,) of each landmark in x, or -1
+    offset: Indices  # (n_landmarks,) of each landmark in x, or -1; -1 less the place that a forgotten one has left
 
 
 class Factors(NamedTuple):

@@ -59,6 +59,7 @@ class Work(NamedTuple, Generic[Room]):
     known: Indices  # (m,) rows of the observations whose landmark is in the state
     at: Indices  # (m,) and its offset there
     label: Indices  # (m,) and its label
+    used: Indices  # (1,) how many these are, fewer after an update that leaves some out
     zhat: Array  # (s m,) expected observations
     scale: Array  # (max(L, s m),) diagonal of what is factored
     S: Array  # (s m, s m) innovation covariance, upper half
@@ -86,6 +87,7 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
         integers(m, 0),
         integers(m, 0),
         integers(m, 0),
+        integers(1, 0),
         vector(rows),
         vector(max(3 + w * m, rows)),
         matrix(rows, rows),

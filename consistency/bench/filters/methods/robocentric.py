@@ -19,14 +19,16 @@ from consistency.bench.filters.parts.sensors import growth_of
 from consistency.bench.filters.textbook.inverse_range import Corrections, searched
 from consistency.bench.filters.textbook.robocentric import (
     ADRIFT,
+    BLURRED,
     COOLING,
     COOLING_EARLY,
     DOUBT,
-    KNOWN,
+    NEAR,
     PASSES,
     PASSES_CHAINED,
     PASSES_EARLY,
     TEMPERED,
+    UNTURNED,
     RobotCentredKalman,
     rounds,
 )
@@ -50,12 +52,13 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
         adrift = ADRIFT**2 if which.iteration and which.adrift else np.inf
         passes, chain = PASSES if which.iteration else 1, PASSES_CHAINED if which.tempering else PASSES_EARLY
         decades, cooling = (0.0, COOLING) if which.tempering else (TEMPERED, COOLING_EARLY)
-        waiting = KNOWN if which.waiting else 0.0
+        blurred = BLURRED if which.forgetting else 0.0
+        unturned, held = (UNTURNED**2, DOUBT**2) if which.waiting else (np.inf, np.inf)
         return ekf.parts(problem, controls, uvd)._replace(
             landmark=InverseRange(sensor.mount.packed()), error=InvariantPose(which.moments), point=Converted(),
             update=Converting(
-                pixels, waiting, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
-                which.spread, decades, cooling,
+                pixels, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
+                which.spread, which.own_spread, decades, cooling, which.waiting, unturned, held, blurred, NEAR,
             ),
             covariance=Parking(every, unseen, doubt, adrift, which.turning, which.patience),
         )  # fmt: skip
@@ -63,7 +66,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
     return Compiled(textbook, parts, textbook.sensors)
 
 
-PLAIN = Corrections(parking=False, turning=False, iteration=False)
+PLAIN = Corrections(parking=False, turning=False, iteration=False, own_spread=False, forgetting=False)
 FILTERS = {
     "parked-ekf-uvd": compiled(RobotCentredKalman("parked-ekf-uvd", Corrections())),
     "robocentric-ekf-uvd": compiled(RobotCentredKalman("robocentric-ekf-uvd", PLAIN)),

@@ -36,10 +36,10 @@ from consistency.bench.filters.parts.inverse_range import (
     carried,
     conversion_jacobian,
     convert,
-    curvature,
+    second_order,
     subtract_bias,
 )
-from consistency.bench.filters.parts.parking import Clones
+from consistency.bench.filters.parts.parking import Clones, forget, is_out_of_sight
 from consistency.referee.types import Array, Indices
 
 
@@ -47,24 +47,33 @@ from consistency.referee.types import Array, Indices
 class Converting(NamedTuple):
     """What is known of the pixels, and what is done about a return.
 
-    ``waiting``: alone and in doubt it stays parked if its distance is known to this part of it; ``passes`` of such an
-    update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no more than landmarks.
-    ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a motion moves landmarks
-    by the mean of its noise to second order; ``spread``: and adds to their covariance what that noise spreads them.
-    The noise of a new return in doubt is raised by so many ``decades`` at first, that of any return by as many as it is
-    below what is predicted if these are 0, and by ``cooling`` less in each pass.
+    ``passes`` of such an update at most, and of one in a ``chain``, tried first, 0 for none; ``clones`` at most, and no
+    more than landmarks. ``recency``: a moved robot keeps the errors from before its last motion; ``curvature``: a
+    motion moves landmarks by the mean of its noise to second order; ``spread``: and adds to their covariance what that
+    noise and, with ``own_spread``, their own errors add to second order. The noise of a new return in doubt is raised
+    by so many ``decades`` at first, that of any return by as many as it is below what is predicted if these are 0, and
+    by ``cooling`` less in each pass. ``leaving_out``: a return that does not settle is left out of the update. A
+    landmark in doubt stays parked where the variance of the turn since its clone, rad^2, is above ``unturned`` after
+    its first update, and above ``held`` after later ones. One in use and out of sight is forgotten where its direction,
+    rad, or its rho are known no better than ``blurred``, 0 for never: its rho in relation to itself, and only if that
+    is above ``near``.
     """
 
     pixels: Pixels
-    waiting: float
     passes: int
     chain: int
     clones: int
     recency: bool
     curvature: bool
     spread: bool
+    own_spread: bool
     decades: float
     cooling: float
+    leaving_out: bool
+    unturned: float
+    held: float
+    blurred: float
+    near: float
 
 
 @part(update="Converting")
@@ -98,7 +107,8 @@ class ConvertingRoom(NamedTuple):
     noise: Array  # (4, n) what the motion of this step added to the errors, for each of its noises and their squares
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
-    mixed: Array  # (n / 3, 3) error of each by the noise of the drive times that of its rho, one standard deviation
+    own_spread: Array  # (n / 3, 3, 3) covariance that the errors of each alone add to second order, upper half
+    ways: Array  # (2, 5, 4) derivatives by these errors
     three: Array  # (4, 3, 3)
     poses: Array  # (5, 3)
 
@@ -122,7 +132,7 @@ def converting_room(update: Converting, w: int, s: int, m: int, n: int) -> Conve
         matrix(c + 1, 3), blocks(c + 1, 3, 3), blocks(c + 1, 3, 3),
         blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3),
         matrix(m, 3), matrix(m, 3), blocks(m, 3, 3), vector(most), vector(most),
-        matrix(4, n), integers(n // 3, 0), blocks(n // 3, 3, 3), matrix(n // 3, 3),
+        matrix(4, n), integers(n // 3, 0), blocks(n // 3, 3, 3), blocks(n // 3, 3, 3), blocks(2, 5, 4),
         blocks(4, 3, 3), matrix(5, 3),
     )  # fmt: skip
 
@@ -150,7 +160,7 @@ def predict_centred(
     for label in range(len(state.offset)):
         o = state.offset[label]
         if o >= 0 and local.of[label] < 0:
-            J, D, there = room.J[moving], room.three[0], room.poses[0]
+            J, D, L, means, there = room.J[moving], room.three[0], room.three[1], room.three[2], room.poses[0]
             rho = x[o + 2]
             point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D)
             along, about = u[0] * slam.motion.sigma_v, u[0] * slam.motion.sigma_omega
@@ -158,14 +168,22 @@ def predict_centred(
                 noise[0, o + a] = -along * rho * (D[a, 0] * c + D[a, 1] * s)
                 noise[1, o + a] = about * (D[a, 0] * point[1] - D[a, 1] * point[0])
             if update.curvature or update.spread:
-                of_drive, of_turn = curvature(point, rho, D, turn, slam.landmark.mount, along, about)
+                take_root(P, o, L)
+                second_order(
+                    x[o : o + 3], L, point, D, turn, slam.landmark.mount, along, about, room.ways[0], room.ways[1],
+                    means, room.own_spread[moving],
+                )  # fmt: skip
+                if not update.own_spread:
+                    of_rho = along * np.sqrt(P[o + 2, o + 2])
+                    for a in range(3):
+                        for b in range(3):
+                            by_drive = (D[a, 0] * c + D[a, 1] * s) * (D[b, 0] * c + D[b, 1] * s)
+                            room.own_spread[moving, a, b] = of_rho * of_rho * by_drive
                 for a in range(3):
                     if update.curvature:
-                        there[a] += of_drive[a] + of_turn[a]
+                        there[a] += means[0, a] + means[1, a]
                     if update.spread:  # the square of a normal of variance s^2 has variance 2 s^4
-                        noise[2, o + a], noise[3, o + a] = np.sqrt(2.0) * of_drive[a], np.sqrt(2.0) * of_turn[a]
-                        by_range = along * np.sqrt(P[o + 2, o + 2])
-                        room.mixed[moving, a] = by_range * (D[a, 0] * c + D[a, 1] * s)
+                        noise[2, o + a], noise[3, o + a] = np.sqrt(2.0) * means[0, a], np.sqrt(2.0) * means[1, a]
             copy(there, x[o : o + 3])
             room.moving[moving] = o
             moving += 1
@@ -177,7 +195,37 @@ def predict_centred(
         o = room.moving[i]
         for a in range(3):
             for b in range(a, 3):
-                P[o + a, o + b] += room.mixed[i, a] * room.mixed[i, b]
+                P[o + a, o + b] += room.own_spread[i, a, b]
+    if update.blurred > 0.0:
+        for label in range(len(state.offset)):
+            o = state.offset[label]
+            if o >= 0 and is_out_of_sight(label, local) and _is_driven_through(update, x, P, o, noise[1, o]):
+                forget(label, state, local)
+
+
+@inner
+def _is_driven_through(update: Converting, x: Array, P: Array, o: int, fresh: float) -> bool:
+    """Whether a linear model no longer holds where the landmark at ``o`` is, as after driving through it.
+
+    ``fresh`` is the standard deviation that the turn of this step added to its azimuth.
+    """
+    rho, most = x[o + 2], update.blurred * update.blurred
+    is_anywhere = P[o, o] - fresh * fresh > most or P[o + 1, o + 1] > most
+    return rho <= 0.0 or is_anywhere or (rho > update.near and P[o + 2, o + 2] > most * rho * rho)
+
+
+@inner
+def take_root(P: Array, o: int, L: Array) -> None:
+    """``L`` (3, 3) <- lower root of the block at ``o`` of P; a column is zero where nothing is left of the variance."""
+    for j in range(3):
+        for i in range(3):
+            rest = P[o + j, o + i] if i >= j else 0.0
+            for c in range(j if i >= j else 0):
+                rest -= L[i, c] * L[j, c]
+            if i > j:
+                L[i, j] = rest / L[j, j] if L[j, j] > 0.0 else 0.0
+            else:
+                L[i, j] = np.sqrt(max(rest, 0.0))
 
 
 @inner

@@ -109,41 +109,98 @@ def carried(y: Array, turn: Frame, mount: Mounting, there: Array, J: Array, D: A
 
 
 @inner
-def bent(q: Triple, rho: float, w: Triple) -> Triple:
-    """Second derivative of azimuth, elevation and rho / |q| along q + s w, at s = 0."""
+def bent(q: Triple, rho: float, u: Array, w: Array) -> Triple:
+    """Second derivative of azimuth, elevation and rho / |q| along u (4,) and w (4,), derivatives of q and of rho."""
     h2 = q[0] * q[0] + q[1] * q[1]
     r2 = h2 + q[2] * q[2]
     h, r = np.sqrt(h2), np.sqrt(r2)
-    flat = q[0] * w[0] + q[1] * w[1]
-    whole = flat + q[2] * w[2]
-    w2 = w[0] * w[0] + w[1] * w[1]
-    dh, dr = flat / h, whole / r
-    ddh, ddr = (w2 - dh * dh) / h, (w2 + w[2] * w[2] - dr * dr) / r
-    de = (h * w[2] - q[2] * dh) / r2
+    flat_u, flat_w = q[0] * u[0] + q[1] * u[1], q[0] * w[0] + q[1] * w[1]
+    across_u, across_w = q[0] * u[1] - q[1] * u[0], q[0] * w[1] - q[1] * w[0]
+    whole_u, whole_w = flat_u + q[2] * u[2], flat_w + q[2] * w[2]
+    up_u, up_w = h * u[2] - q[2] * flat_u / h, h * w[2] - q[2] * flat_w / h
+    level = u[0] * w[0] + u[1] * w[1]
+    by_range = rho * (3.0 * whole_u * whole_w / r2 - level - u[2] * w[2]) - u[3] * whole_w - w[3] * whole_u
     return (
-        -2.0 * (q[0] * w[1] - q[1] * w[0]) * flat / (h2 * h2),
-        -(q[2] * ddh + 2.0 * de * whole) / r2,
-        rho * (2.0 * dr * dr / r - ddr) / r2,
+        -(across_u * flat_w + across_w * flat_u) / (h2 * h2),
+        -(up_u * whole_w + up_w * whole_u) / (r2 * r2) - q[2] * (level - flat_u * flat_w / h2) / (h * r2),
+        by_range / (r * r2),
     )
 
 
 @inner
-def curvature(
-    b: Triple, rho: float, D: Array, turn: Frame, mount: Mounting, along: float, about: float
-) -> tuple[Triple, Triple]:
-    """What noise of the drive, m, and of the turn, rad, adds to the mean of a landmark, to second order.
+def second_order(
+    y: Array,
+    L: Array,
+    b: Triple,
+    D: Array,
+    turn: Frame,
+    mount: Mounting,
+    along: float,
+    about: float,
+    ways: Array,
+    rays_by: Array,
+    means: Array,
+    own: Array,
+) -> None:
+    """``means`` (2, 3) <- what the noise of drive and of turn adds to the mean of a landmark y (3,), to second order.
 
-    ``b``, ``D`` are those of :func:`carried`. An error s of the turn takes b to b + s (b_y, -b_x, 0) -
-    s^2 / 2 (b_x, b_y, 0), one of the drive to b - s rho (c, s, 0).
-    """
+    ``own`` (3, 3) <- the covariance that its own error and both noises add, less the squares of these: the sum over
+    pairs of the five errors of g g', with g the second derivative of the landmark along both, of size one standard
+    deviation each, and half of that for the square of one. An error s of the turn takes b to Rz(-s) b, one of the drive
+    to b - s rho (c, s, 0).
+
+    Parameters
+    ----------
+    L : (3, 3), lower root of the covariance of y
+    b, D : as of :func:`carried`
+    along, about : standard deviations of drive (m) and turn (rad)
+    ways, rays_by : (5, 4), work arrays: derivatives of b, and of the ray, with that of rho behind both
+    """  # fmt: skip
+    m, rho, c, s = rays(y[0], y[1]), y[2], turn.c, turn.s
+    for k in range(5):
+        way, r = ways[k], L[2, k] if k < 3 else 0.0
+        if k < 3:
+            x, v, z = outward(mount, L[0, k] * m[3] + L[1, k] * m[6], L[0, k] * m[4] + L[1, k] * m[7], L[1, k] * m[8])
+            x, v = x + r * mount.x, v + r * mount.y
+            way[0], way[1], way[2] = c * x - s * v + r * turn.x, s * x + c * v + r * turn.y, z + r * mount.z
+        elif k == 3:
+            way[0], way[1], way[2] = -along * rho * c, -along * rho * s, 0.0
+        else:
+            way[0], way[1], way[2] = about * b[1], -about * b[0], 0.0
+        x, v, z = inward(mount, way[0] - r * mount.x, way[1] - r * mount.y, way[2] - r * mount.z)
+        rays_by[k, 0], rays_by[k, 1], rays_by[k, 2], way[3], rays_by[k, 3] = x, v, z, r, r
     q = inward(mount, b[0] - rho * mount.x, b[1] - rho * mount.y, b[2] - rho * mount.z)
-    t0, t1, t2 = bent(q, rho, inward(mount, b[1], -b[0], 0.0))
-    d0, d1, d2 = bent(q, rho, inward(mount, -rho * turn.c, -rho * turn.s, 0.0))
-    drive, by_turn = 0.5 * along * along, 0.5 * about * about
-    return (drive * d0, drive * d1, drive * d2), (
-        by_turn * (t0 - D[0, 0] * b[0] - D[0, 1] * b[1]),
-        by_turn * (t1 - D[1, 0] * b[0] - D[1, 1] * b[1]),
-        by_turn * (t2 - D[2, 0] * b[0] - D[2, 1] * b[1]),
+    fill_matrix(own, 0.0)
+    for k in range(5):
+        for i in range(k, 5):
+            z = 0.0
+            if i == 4:
+                x, v = about * ways[k, 1], -about * ways[k, 0]
+            elif i == 3:
+                x, v = -along * c * ways[k, 3], -along * s * ways[k, 3]
+            else:
+                flat, up = L[0, k] * L[0, i], L[1, k] * L[1, i]
+                mixed = L[0, k] * L[1, i] + L[1, k] * L[0, i]
+                x, v, z = outward(
+                    mount, -(flat + up) * m[0] - mixed * m[7], -(flat + up) * m[1] + mixed * m[6], -up * m[2]
+                )
+                x, v = c * x - s * v, s * x + c * v
+            p = _bent_and_moved(bent(q, rho, rays_by[k], rays_by[i]), D, x, v, z)
+            for a in range(3):
+                if k == i and k > 2:
+                    means[k - 3, a] = 0.5 * p[a]
+                    continue
+                for j in range(a, 3):
+                    own[a, j] += (0.5 if k == i else 1.0) * p[a] * p[j]
+
+
+@inner
+def _bent_and_moved(g: Triple, D: Array, x: float, y: float, z: float) -> Triple:
+    """g + D (x, y, z)."""
+    return (
+        g[0] + D[0, 0] * x + D[0, 1] * y + D[0, 2] * z,
+        g[1] + D[1, 0] * x + D[1, 1] * y + D[1, 2] * z,
+        g[2] + D[2, 0] * x + D[2, 1] * y + D[2, 2] * z,
     )
 
 

@@ -162,7 +162,8 @@ def _settle(w: int, whole: State, n: int, b: int, local: Factors) -> None:
     """Rows and columns of the active variables in the whole state."""
     P, at, beyond = whole.P, local.label, local.owed[:n, : whole.n]
     for i in range((n - 3) // w):
-        at[i] = whole.offset[at[i]] if at[i] >= 0 else -1 - at[i]
+        p = whole.offset[at[i]] if at[i] >= 0 else at[i]
+        at[i] = p if p >= 0 else -1 - p
     product(local.Phi[:n, :b], local.rows[:b, : whole.n], beyond)
     _settle_rows(whole, 3, 0, 0, beyond, local)
     for i in range(3, n, w):

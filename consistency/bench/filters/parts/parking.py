@@ -183,14 +183,13 @@ def _joined(slam: Slam, whole: State, state: State, local: Clones) -> State:
 @inner
 def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clones) -> bool:
     """Finds what of the ``labels`` returns in doubt, and whether that takes the whole state."""
-    P, step, any_doubted = state.P, local.step[0] - 1, False
+    step, any_doubted = local.step[0] - 1, False
     fill(local.doubted, 0)
     for label in labels:
         number = local.of[label]
         if number >= 0:
-            o = local.here[number] + 2
             local.doubt[label] = 0
-            if P[2, 2] > covariance.adrift or P[2, 2] + P[o, o] - 2.0 * P[2, o] > covariance.doubt:
+            if state.P[2, 2] > covariance.adrift or turn_variance(label, state, local) > covariance.doubt:
                 any_doubted = True
                 local.doubt[label] = 2 if local.seen[label] == step else 1
                 _note_doubt(label, local)
@@ -201,6 +200,29 @@ def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clon
 def is_new(label: int, local: Clones) -> bool:
     """Whether a landmark of this step was not seen in the last one."""
     return local.step[0] - local.earlier[label] > 1
+
+
+@inner
+def is_out_of_sight(label: int, local: Clones) -> bool:
+    """Whether a landmark in use was not seen in the last step, whatever is seen in this."""
+    step = local.step[0]
+    last = local.earlier[label] if local.seen[label] == step else local.seen[label]
+    return local.of[label] < 0 and step - last > 1
+
+
+@inner
+def forget(label: int, state: State, local: Clones) -> None:
+    """A landmark in use is no longer in the state, but for its place."""
+    o = state.offset[label]
+    clear(o, state, local)
+    state.offset[label] = -1 - o
+
+
+@inner
+def turn_variance(label: int, state: State, local: Clones) -> float:
+    """That of the turn since the clone at which a landmark of this step is parked, rad^2."""
+    P, o = state.P, local.here[local.of[label]] + 2
+    return float(P[2, 2] + P[o, o] - 2.0 * P[2, o])
 
 
 @inner
@@ -273,11 +295,16 @@ def unpark(label: int, state: State, local: Clones) -> None:
     local.of[label] = -1
     local.uses[number] -= 1
     if local.uses[number] == 0:
-        o = local.here[number]
-        fill_matrix(local.rows[:3, : state.n], 0.0)
-        replace_rows(state.P, state.n, o, local.rows, local.rows[:, :3])
-        fill(state.x[o : o + 3], 0.0)
-        fill_matrix(local.factors.Phi[o : o + 3, : state.base], 0.0)
+        clear(local.here[number], state, local)
+
+
+@inner
+def clear(o: int, state: State, local: Clones) -> None:
+    """Nothing is left of the block at ``o``."""
+    fill_matrix(local.rows[:3, : state.n], 0.0)
+    replace_rows(state.P, state.n, o, local.rows, local.rows[:, :3])
+    fill(state.x[o : o + 3], 0.0)
+    fill_matrix(local.factors.Phi[o : o + 3, : state.base], 0.0)
 
 
 @implement(held_at, Parking)

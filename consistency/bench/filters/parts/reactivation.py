@@ -24,7 +24,7 @@ from consistency.bench.filters.parts.converting import (
 )
 from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.parts.inverse_range import carried, observe_range
-from consistency.bench.filters.parts.parking import Clones, is_in_doubt, is_new, recentre, unpark
+from consistency.bench.filters.parts.parking import Clones, is_in_doubt, is_new, recentre, turn_variance, unpark
 from consistency.referee.types import Array, Indices
 
 SETTLED = 1e-3  # change in standard deviations that ends an iteration
@@ -42,14 +42,12 @@ def correct_converted(
     local: Clones,
     work: Work[ConvertingRoom],
 ) -> tuple[int, float, float]:
-    room, rho, in_doubt = work.room, work.at[0] + 2, _is_any_in_doubt(m, local, work)
-    waits = in_doubt and m == 1
-    waits = waits and state.P[rho, rho] < (update.waiting * state.x[rho]) ** 2
-    code, clones, chained, total = 0, 0, False, 0.0  # as foreseen; clones are scratch then
-    if in_doubt or not has_innovation:
-        code, clones, chained, total = _aim(update, slam, state, data, m, local, work)
-    if code > 0:
-        return code, np.nan, np.nan
+    room, clones, chained, total = work.room, 0, False, 0.0  # as foreseen; clones are scratch then
+    if _is_any_parked(m, local, work) or not has_innovation:
+        clones, chained, total = _aim(update, slam, state, data, m, update.leaving_out, local, work)
+        m = work.used[0]
+    if m == 0:
+        return 0, np.nan, np.nan
     code, nis, log_det = divide_by_root(state, 3 * m, work, total)
     if code == 0:
         _move(state, m, work)
@@ -60,9 +58,16 @@ def correct_converted(
             move_pose(state.x[:3], work.delta[:3], room.frames[clones])
             copy(room.frames[clones], state.x[:3])
         for i in range(m):
-            if room.clone[i] >= 0 and not waits:
+            if room.clone[i] >= 0 and not _stays(update, work.label[i], state, local):
                 _reactivate(slam, state, work.label[i], local, work)
     return code, nis, log_det
+
+
+@inner
+def _stays(update: Converting, label: int, state: State, local: Clones) -> bool:
+    """Whether the turn since the clone of a landmark in doubt is little known, also after the update."""
+    most = update.unturned if is_new(label, local) else update.held
+    return is_in_doubt(label, local) and turn_variance(label, state, local) > most
 
 
 @implement(predict_innovation, Converting)
@@ -78,14 +83,14 @@ def predict_innovation_converted(
 ) -> tuple[int, float]:
     """As far as the update; a chain moves clones and covariance on its way, and they are put back."""
     if not _is_any_in_doubt(m, local, work) or update.chain == 0:
-        code, _, _, total = _aim(update, slam, state, data, m, local, work)
-        return code, total
+        _, _, total = _aim(update, slam, state, data, m, False, local, work)
+        return 0, total
     x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), local.origin.copy()
-    code, _, _, total = _aim(update, slam, state, data, m, local, work)
+    _, _, total = _aim(update, slam, state, data, m, False, local, work)
     copy(x, state.x[: state.n])
     copy_matrix(P, state.P[: state.n, : state.n])
     copy_matrix(origin, local.origin)
-    return code, total
+    return 0, total
 
 
 @inner
@@ -95,31 +100,55 @@ def _aim(
     state: State,
     data: Data,
     m: int,
+    leaving_out: bool,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> tuple[int, int, bool, float]:
+) -> tuple[int, bool, float]:
     """A, S and the innovation where the update leads, found by iteration where something was parked.
 
-    Returns a code of REASONS, how many clones are in it, whether in a chain, and a sum that is finite if all is.
+    Where that does not settle, with ``leaving_out`` ``work`` lists only what was not parked. Returns how many clones
+    are in it, whether in a chain, and a sum that is finite if all is.
     """
     room = work.room
     chained = _is_any_in_doubt(m, local, work) and update.chain > 0
     if chained:
         recentre(state, local)
-    clones, code = _gather(state, m, chained, local, work), 0
-    if chained:
-        code, chained = _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
-    if code == 0 and not chained and clones > 0 and update.passes > 1:
-        code, _ = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
-    if code > 0:
-        return code, clones, chained, np.nan
+    clones = _gather(state, m, chained, local, work)
+    chained = chained and _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
+    if not chained and clones > 0 and update.passes > 1:
+        is_settled = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
+        if leaving_out and not is_settled:
+            m = _leave_out_parked(m, local, work)
+            clones = _gather(state, m, False, local, work)
     if clones == 0 or update.passes == 1:
         fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
         aim_apart(state, m, clones, update.recency, local, room)
         _expect(update, slam, state, data, True, m, clones, local, work)
     if chained:
         cast_state(state, m, clones, room)
-    return 0, clones, chained, _innovate(room.rows, state.n + state.base, room.at, m, work)
+    return clones, chained, _innovate(room.rows, state.n + state.base, room.at, m, work)
+
+
+@inner
+def _leave_out_parked(m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
+    """``work`` lists, of the ``m`` landmarks, those in use; returns how many. The others count as not seen."""
+    left = 0
+    for i in range(m):
+        if local.of[work.label[i]] < 0:
+            work.known[left], work.label[left], work.at[left] = work.known[i], work.label[i], work.at[i]
+            left += 1
+        else:
+            local.seen[work.label[i]] = local.earlier[work.label[i]]
+    work.used[0] = left
+    return left
+
+
+@inner
+def _is_any_parked(m: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
+    is_parked = False
+    for i in range(m):
+        is_parked = is_parked or local.of[work.label[i]] >= 0
+    return is_parked
 
 
 @inner
@@ -193,8 +222,8 @@ def _iterate(
     is_chained: bool,
     local: Clones,
     work: Work[ConvertingRoom],
-) -> tuple[int, bool]:
-    """Gauss-Newton on what the update involves; returns a code of REASONS, and whether it settled in ``passes``.
+) -> bool:
+    """Gauss-Newton on what the update involves; returns whether it settled in ``passes``.
 
     ``room`` has the last linearisation, ``delta`` where it was made.
     """
@@ -229,7 +258,7 @@ def _iterate(
         total = _innovate(cast, size, room.place, m, work)
         code, _, _ = divide_by_root(alone, 3 * m, work, total)
         if code > 0:
-            return code, False
+            return False
         fill(delta, 0.0)
         add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
         if is_chained:
@@ -240,7 +269,7 @@ def _iterate(
     copy(room.before[:size], delta)
     if is_chained:
         aim_chained(state, m, clones, local, room)
-    return 0, is_settled
+    return is_settled
 
 
 @inner

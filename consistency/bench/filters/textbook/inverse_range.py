@@ -32,15 +32,19 @@ class Corrections(NamedTuple):
     debiasing: bool = True
     prediction: bool = True  # noise of what is observed taken where it is predicted, not where it was measured
     iteration: bool = True
-    waiting: bool = True  # what returns in doubt, and is all that is seen, stays parked
+    waiting: bool = (
+        True  # a return in doubt stays parked until the turn is known, and is left out if it does not settle
+    )
     recency: bool = True  # an update about a moved robot leaves the errors from before its last motion as they are
     curvature: bool = True  # mean of a landmark that moves, to second order in the noise of turn and drive
     promptness: bool = True  # landmarks are parked soon
-    spread: bool = True  # covariance of a landmark that moves, to second order in the noise of turn and drive
+    spread: bool = True  # and its covariance, to second order in these and in the error of rho times the drive
+    own_spread: bool = True  # and in all of its own errors
     patience: bool = True  # nothing is parked at a pose whose last motions are not yet corrected by a sight
     moments: bool = True  # the covariance of the pose is that of Exp(xi) T, not of a linear error
     adrift: bool = True  # a return is in doubt, too, where the robot's own heading is little known
     tempering: bool = True  # the noise of a return begins at what is not known of it
+    forgetting: bool = True  # a landmark that the robot drives through is forgotten
 
 
 # --- geometry ----------------------------------------------------------------------------------------
@@ -54,6 +58,14 @@ def unit_vectors(y: Array) -> tuple[Array, Array]:
     by_azimuth = np.stack([-ce * sa, ce * ca, np.zeros_like(ca)], axis=-1)
     by_elevation = np.stack([-se * ca, -se * sa, ce], axis=-1)
     return m, np.stack([by_azimuth, by_elevation], axis=-1)
+
+
+def bent_unit_vectors(y: Array) -> Array:
+    """Second derivatives (m, 2, 2, 3) of the unit vectors of azimuth and elevation."""
+    m, dm = unit_vectors(y)
+    flat = m * [1.0, 1.0, 0.0]
+    mixed = np.stack([-dm[:, 1, 1], dm[:, 0, 1], np.zeros(len(y))], axis=1)
+    return np.stack([np.stack([-flat, mixed], axis=1), np.stack([mixed, -m], axis=1)], axis=1)
 
 
 def in_new_frame(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[Array, Array, Array, Array]:
@@ -82,39 +94,72 @@ def in_new_frame(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> tuple[
     return there, J, D @ axes.T, b
 
 
-def second_derivative(q: Array, rho: Array, w: Array) -> Array:
-    """Second derivative (m, 3) of azimuth, elevation and rho / |q| along q + s w, at s = 0; q, w (m, 3), rho (m,)."""
-    h2, r2 = (q[:, :2] ** 2).sum(axis=1), (q**2).sum(axis=1)
-    h, r = np.sqrt(h2), np.sqrt(r2)
-    flat, whole = (q[:, :2] * w[:, :2]).sum(axis=1), (q * w).sum(axis=1)
-    dh, dr = flat / h, whole / r
-    ddh, ddr = ((w[:, :2] ** 2).sum(axis=1) - dh**2) / h, ((w**2).sum(axis=1) - dr**2) / r
-    de = (h * w[:, 2] - q[:, 2] * dh) / r2
-    azimuth = -2.0 * (q[:, 0] * w[:, 1] - q[:, 1] * w[:, 0]) * flat / h2**2
-    elevation = -(q[:, 2] * ddh + 2.0 * de * whole) / r2
-    return np.stack([azimuth, elevation, rho * (2.0 * dr**2 / r - ddr) / r2], axis=1)
-
-
-def mean_shift(
-    b: Array, rho: Array, D: Array, along: Array, noise: tuple[float, float], sensor: BelievedSensor
-) -> Array:
-    """What noise of drive and of turn adds to the mean of landmarks, to second order, (m, 3, 2).
-
-    An error s of the turn takes b to Rz(-s) b = b + s (b_y, -b_x, 0) - s^2 / 2 (b_x, b_y, 0), one of the drive to
-    b - s rho ``along``: the mean moves by half of each variance times the second derivative of the landmark by s.
+def bent(q: Array, rho: Array, u: Array, w: Array, by_u: Array | float = 0.0, by_w: Array | float = 0.0) -> Array:
+    """Second derivative (..., 3) of azimuth, elevation and rho / |q| along two directions.
 
     Parameters
     ----------
-    b, rho, D : (m, 3), (m,), (m, 3, 3), as of :func:`in_new_frame`
-    along : (3,), direction of the drive in the new frame of the robot
-    noise : standard deviations of drive (m) and turn (rad)
+    q, rho : (..., 3), (...), where it is taken
+    u, w : (..., 3), derivatives of q along the one and the other direction
+    by_u, by_w : (...), those of rho
+    """
+    h2, r2 = (q[..., :2] ** 2).sum(axis=-1), (q**2).sum(axis=-1)
+    h, r = np.sqrt(h2), np.sqrt(r2)
+
+    def parts(v: Array) -> tuple[Array, Array, Array, Array]:
+        flat = (q[..., :2] * v[..., :2]).sum(axis=-1)
+        across, up = q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0], h * v[..., 2] - q[..., 2] * flat / h
+        return flat, flat + q[..., 2] * v[..., 2], across, up
+
+    (flat_u, whole_u, across_u, up_u), (flat_w, whole_w, across_w, up_w) = parts(u), parts(w)
+    level = (u[..., :2] * w[..., :2]).sum(axis=-1)
+    azimuth = -(across_u * flat_w + across_w * flat_u) / h2**2
+    elevation = -(up_u * whole_w + up_w * whole_u) / r2**2 - q[..., 2] * (level - flat_u * flat_w / h2) / (h * r2)
+    by_range = rho * (3.0 * whole_u * whole_w / r2 - (u * w).sum(axis=-1)) - by_u * whole_w - by_w * whole_u
+    return np.stack([azimuth, elevation, by_range / (r * r2)], axis=-1)
+
+
+def second_derivatives(y: Array, R: Array, t: Array, sensor: BelievedSensor) -> Array:
+    """Second derivatives (m, 5, 5, 3) of landmarks y (m, 3) after a change b -> R b + t of the robot's frame.
+
+    They are those by a, e and rho of each, and by errors of the drive, m, and of the turn, rad. An error s of the turn
+    takes b, rho times the point in the new frame of the robot, to Rz(-s) b, one of the drive to b - s rho R e_x.
     """
     offset, axes = mounted(sensor)
-    q, flat = (b - rho[:, None] * offset) @ axes, b * [1.0, 1.0, 0.0]
-    by_turn = np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1) @ axes
-    of_turn = second_derivative(q, rho, by_turn) - (D @ flat[:, :, None])[:, :, 0]
-    of_drive = second_derivative(q, rho, -rho[:, None] * (along @ axes))
-    return np.asarray(0.5 * np.square(noise) * np.stack([of_drive, of_turn], axis=2))
+    (_, dm), rho, count = unit_vectors(y), y[:, 2], len(y)
+    _, _, D, b = in_new_frame(y, R, t, sensor)
+
+    def turned(v: Array) -> Array:
+        return np.stack([v[..., 1], -v[..., 0], np.zeros(v.shape[:-1])], axis=-1)
+
+    first, second, of_rho = np.zeros((count, 5, 3)), np.zeros((count, 5, 5, 3)), np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    first[:, :2], first[:, 2] = np.swapaxes(dm, 1, 2) @ axes.T @ R.T, R @ offset + t
+    first[:, 3], first[:, 4] = -rho[:, None] * R[:, 0], turned(b)
+    second[:, :2, :2] = bent_unit_vectors(y) @ axes.T @ R.T
+    second[:, 2, 3] = second[:, 3, 2] = -R[:, 0]
+    second[:, :, 4] = second[:, 4, :] = turned(first)
+    q, w = (b - rho[:, None] * offset) @ axes, (first - of_rho[:, None] * offset) @ axes
+    along_both = bent(q[:, None, None], rho[:, None, None], w[:, :, None], w[:, None], of_rho[:, None], of_rho)
+    return np.asarray(along_both + second @ np.swapaxes(D, 1, 2)[:, None])
+
+
+def spread_by_pairs(second: Array, P: Array, sigmas: tuple[float, float]) -> Array:
+    """Covariance (m, 3, 3) that errors of landmarks and the noise of a motion add to second order.
+
+    It is 1/2 tr(G_i S G_j S) with the second derivatives G and the covariance S of all five errors, without the squares
+    of drive and turn, which are errors of all landmarks together.
+
+    Parameters
+    ----------
+    second : (m, 5, 5, 3), as of :func:`second_derivatives`
+    P : (m, 3, 3), covariance of the landmarks before the motion
+    sigmas : standard deviations of drive (m) and turn (rad)
+    """
+    G, S, noises = np.moveaxis(second, -1, 1).copy(), np.zeros((len(P), 5, 5)), [3, 4]
+    G[:, :, noises, noises] = 0.0
+    S[:, :3, :3], S[:, noises, noises] = P, np.square(sigmas)
+    GS = G @ S[:, None]
+    return np.asarray(0.5 * np.einsum("mikl,mjlk->mij", GS, GS))
 
 
 def moved_pose(pose: Array, xi: Array) -> Array:

@@ -13,18 +13,22 @@ poses by decimetres, and what is known of the motion
 from one clone to the next is known in the frame of the first, wherever that is moved. So the poses are moved along a
 chain, E_j = E_j-1 Exp(xi_j - xi_j-1), T_j <- E_j T_j, and the covariance is *turned* with them: the error about the
 moved poses is that of pose j - 1 plus Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of what is left of xi_j and
-xi_j-1. The robot hangs on the last clone. Where it sees nothing but one landmark in doubt, that landmark *waits* at
-its clone: the robot may then be anywhere on a circle about it, a straight line in xi, whereas a landmark in the frame
-of the robot would keep p + R m / rho to first order only. From the second such step on the robot hangs on that clone,
-since a turn about a point is Exp of one xi, and of a sum of many to first order only.
+xi_j-1. The robot hangs on the last clone. A landmark in doubt *waits* at its clone while the turn is little known also
+after the update: the robot may then be anywhere on a circle about it, a straight line in xi, whereas a landmark in the
+frame of the robot would keep p + R m / rho to first order only, with an error of half its distance times the square of
+the turn's. From the second such step on the robot hangs on that clone, since a turn about a point is Exp of one xi, and
+of a sum of many to first order only; and the landmark waits until the turn is known better than at its first sight.
 
 Where a return is hardly predicted, Gauss-Newton overshoots: its noise begins at what is not known of it and falls by
-ten in a pass (*tempering*).
+ten in a pass (*tempering*). A return that does not settle is left out of the update, and tried again when it is seen
+next.
 
 What an iterated update finds of the robot's error where nothing is in doubt is mostly the noise nu of the last motion,
 T_true = Exp(xi) Exp(nu) T. The error about Exp(nu) T is xi, and not J_l(nu) xi (*recency*). The noise of turn and
-drive also moves the mean of a landmark by half of its variance times the landmark's second derivative (*curvature*),
-and adds the variance of that term and of the error of rho times the noise of the drive (*spread*). A clone that was
+drive also moves the mean of a landmark by half of its variance times the landmark's second derivative (*curvature*).
+The covariance of the second-order terms, of this noise and of the landmark's own error, is added to that of the
+landmark (*spread*). Where the robot drives through a landmark, no such expansion holds: one out of sight whose
+direction or rho is known no better is forgotten (*forgetting*). A clone that was
 made before its noise nu is known would be turned by nu / 2 when that is found, so that parking waits where the robot
 sees nothing and saw something lately (*patience*). The covariance of the pose is that of Exp(xi) T about T
 (*moments*).
@@ -53,16 +57,18 @@ from consistency.bench.filters.textbook.inverse_range import (
     conversion_bias,
     converted,
     in_new_frame,
-    mean_shift,
     observed,
     pose_moments,
     poses_moved,
     searched,
+    second_derivatives,
+    spread_by_pairs,
 )
 from consistency.bench.filters.textbook.robocentric_state import (
     CentredState,
     Chart,
     activated,
+    block_at,
     charted,
     clones_of,
     expectation,
@@ -71,6 +77,7 @@ from consistency.bench.filters.textbook.robocentric_state import (
     point_in_world,
     settled_clones,
     shifts_of,
+    turn_variance,
     with_parked,
     without_block,
     without_idle_clones,
@@ -87,7 +94,9 @@ DOUBT = (
     0.02  # rad, standard deviation of the turn since its clone from which a landmark's return is not a linear update
 )
 ADRIFT = 0.2  # rad, standard deviation of the heading from which any return is in doubt
-KNOWN = 0.03  # relative standard deviation of its distance up to which a landmark may wait
+UNTURNED = 0.05  # rad, that of the turn after its first update, above which a landmark in doubt stays parked
+BLURRED = 0.3  # rad, and of rho: standard deviation above which a landmark out of sight is forgotten
+NEAR = 0.8  # 1/m, rho from which that of rho is asked for
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
 COOLING = 1.0  # decades a pass by which the raised noise of a return becomes less
@@ -143,39 +152,58 @@ class RobotCentredKalman:
         sigmas = (control.dt * belief.motion.sigma_v, control.dt * belief.motion.sigma_omega)
         bends = np.zeros((n, 2))
         x[:3] = basics.pose_after(x[:3], control)
-        active = [at for label, at in state.places.items() if label not in state.parked]
+        active = [label for label in state.places if label not in state.parked]
         if active:
-            rows = np.array(active)[:, None] + np.arange(3)
+            rows = np.array([state.places[label] for label in active])[:, None] + np.arange(3)
+            blocks = rows[:, :, None], rows[:, None, :]
             forward, turn = control.dt * control.v, control.dt * control.omega
             R = heading_matrix(-turn)
-            y, J, D, b = in_new_frame(x[rows], R, -R[:, 0] * forward, belief.sensor)
-            rho = x[rows][:, 2:]
-            bends[rows] = mean_shift(b, rho[:, 0], D, R[:, 0], sigmas, belief.sensor)
+            t = -R[:, 0] * forward
+            y, J, D, b = in_new_frame(x[rows], R, t, belief.sensor)
+            second = second_derivatives(x[rows], R, t, belief.sensor)
+            bends[rows] = 0.5 * np.square(sigmas) * np.stack([second[:, 3, 3], second[:, 4, 4]], axis=2)
+            if self.which.spread and self.which.own_spread:
+                Q[blocks] = spread_by_pairs(second, state.P[blocks], sigmas)
+            elif self.which.spread:
+                along, of_rho = D @ R[:, 0], state.P[rows[:, 2], rows[:, 2]]
+                Q[blocks] = sigmas[0] ** 2 * of_rho[:, None, None] * along[:, :, None] * along[:, None, :]
+            F[blocks], rho = J, x[rows][:, 2:]
             x[rows] = y + bends[rows].sum(axis=2) if self.which.curvature else y
-            if self.which.spread:  # of the drive, and of the error of rho times it
-                along = D @ R[:, 0]
-                by_range = sigmas[0] ** 2 * state.P[rows[:, 2], rows[:, 2]]
-                Q[rows[:, :, None], rows[:, None, :]] = by_range[:, None, None] * along[:, :, None] * along[:, None, :]
-            F[rows[:, :, None], rows[:, None, :]] = J
             by_forward, by_turn = -rho * R[:, 0], np.stack([b[:, 1], -b[:, 0], np.zeros(len(b))], axis=1)
             G[rows] = control.dt * (D @ np.stack([by_forward, by_turn], axis=2))
         noise = G * [belief.motion.sigma_v, belief.motion.sigma_omega]
         if self.which.spread:  # the square of a normal of variance s^2 has mean s^2 and variance 2 s^4
             noise = np.hstack([noise, np.sqrt(2.0) * bends])
-        return replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T + Q, step=state.step + 1, noise=noise)
+        after = replace(state, x=x, P=F @ state.P @ F.T + noise @ noise.T + Q, step=state.step + 1, noise=noise[:3])
+        if self.which.forgetting:
+            for label in active:
+                if after.step - after.seen[label] > 1 and self._is_driven_through(
+                    after, label, noise[state.places[label], 1]
+                ):
+                    after = self.forget(after, label)
+        return after
 
     def update(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
+        return self._updated(state, observation, leaving_out=self.which.waiting and self.which.iteration)
+
+    def expected(self, state: CentredState, observation: Observation) -> tuple[CentredState, Info]:
+        """As :meth:`update`, with rows of returns, too, that would not settle: for a guard."""
+        return self._updated(state, observation, leaving_out=False)
+
+    def _updated(self, state: CentredState, observation: Observation, leaving_out: bool) -> tuple[CentredState, Info]:
         labels = [int(label) for label in observation.landmarks]
         known = np.array([label in state.places for label in labels], dtype=bool)
+        taken = [label for label in labels if label not in state.places]
         info = Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0)))
         bias = bias_at(observation.z, state.problem.belief.sensor)
         unbiased = observation.z - bias
         if known.any():
             seen = [label for label in labels if label in state.places]
-            state, info = self._correct(state, seen, unbiased[known], bias[known, 2])
+            state, info, used = self._correct(state, seen, unbiased[known], bias[known, 2], leaving_out)
+            taken += used
         for label, z in zip(np.array(labels)[~known], unbiased[~known], strict=True):
             state = self._inserted(state, int(label), z)
-        state = replace(state, seen=state.seen | dict.fromkeys(labels, state.step))
+        state = replace(state, seen=state.seen | dict.fromkeys(taken, state.step))
         every, unseen = rounds(self.which)
         blind = state.step - max(state.seen.values(), default=0)
         is_due = every > 0 and (state.is_due or state.step % every == 0)
@@ -184,7 +212,10 @@ class RobotCentredKalman:
             state = with_parked(state, unseen)
         return replace(state, is_due=is_due and waits), info
 
-    def _correct(self, state: CentredState, seen: list[int], z: Array, shift: Array) -> tuple[CentredState, Info]:
+    def _correct(
+        self, state: CentredState, seen: list[int], z: Array, shift: Array, leaving_out: bool
+    ) -> tuple[CentredState, Info, list[int]]:
+        """The state after the update, its innovation, and the landmarks in it: with ``leaving_out`` not all seen."""
         is_parked = np.array([label in state.parked for label in seen])
         in_doubt = np.array([self._is_in_doubt(state, label) for label in seen])
         new = np.array([state.step - state.seen[label] > 1 for label in seen])
@@ -201,15 +232,25 @@ class RobotCentredKalman:
             found = self._solved(state, P, seen, z, shift, is_parked, in_doubt, new, chart, passes)
             if found.is_settled:
                 break
+        else:
+            if leaving_out and is_parked.all():
+                return state, Info(np.zeros(0), np.zeros((0, 0)), np.zeros((len(state.x), 0))), []
+            if leaving_out and is_parked.any():
+                rest = [label for label in seen if label not in state.parked]
+                return self._correct(state, rest, z[~is_parked], shift[~is_parked], leaving_out=False)
         after, turned = moved_by(state, found.delta), np.eye(len(state.x))
         if chart is not separate:
             (after, _), turned = charted(state, found.delta, chart), found.C
         turned = np.linalg.inv(shifts_of(after)) @ turned
         after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
-        back = [label for label in seen if label in state.parked]
-        if self.which.waiting and len(seen) == 1 and in_doubt.any() and self._waits(state, seen[0]):
-            back = []
-        return activated(after, back), Info(found.innovation, found.S, found.W)
+        waits = in_doubt if self.which.waiting else np.zeros(len(seen), bool)
+        limits = np.where(new, UNTURNED, DOUBT)
+        back = [
+            label
+            for label, may_wait, limit in zip(seen, waits, limits, strict=True)
+            if label in state.parked and not (may_wait and turn_variance(after, label) > limit**2)
+        ]
+        return activated(after, back), Info(found.innovation, found.S, found.W), seen
 
     def _solved(
         self, state: CentredState, P: Array, seen: list[int], z: Array, shift: Array, is_parked: Array,
@@ -247,15 +288,19 @@ class RobotCentredKalman:
         """Whether the turn since the clone of a parked landmark or the heading was little known before the motion."""
         if not self.which.iteration or label not in state.parked:
             return False
-        clone = state.clones[state.parked[label]] + 2
-        fresh, turn = state.noise[2] @ state.noise[2], state.P[2, 2] + state.P[clone, clone] - 2.0 * state.P[2, clone]
+        fresh = state.noise[2] @ state.noise[2]
         is_adrift = self.which.adrift and state.P[2, 2] - fresh > ADRIFT**2
-        return bool(is_adrift or turn - fresh > DOUBT**2)
+        return bool(is_adrift or turn_variance(state, label) - fresh > DOUBT**2)
 
-    def _waits(self, state: CentredState, label: int) -> bool:
-        """Whether the distance of a parked landmark from its clone is well known."""
-        rho = state.places[label] + 2
-        return bool(state.P[rho, rho] < (KNOWN * state.x[rho]) ** 2)
+    def _is_driven_through(self, state: CentredState, label: int, fresh: float) -> bool:
+        """Whether a linear model no longer holds where a landmark is, as after driving through it.
+
+        ``fresh`` is the standard deviation that the turn of this step added to its azimuth.
+        """
+        at = block_at(state.places[label])
+        (of_azimuth, of_elevation, of_rho), rho = np.diag(state.P)[at], state.x[at][2]
+        is_anywhere = max(of_azimuth - fresh**2, of_elevation) > BLURRED**2
+        return bool(rho <= 0.0 or is_anywhere or (rho > NEAR and of_rho > (BLURRED * rho) ** 2))
 
     def _inserted(self, state: CentredState, label: int, z: Array) -> CentredState:
         sensor, n = state.problem.belief.sensor, len(state.x)

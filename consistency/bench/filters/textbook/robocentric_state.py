@@ -34,7 +34,7 @@ class CentredState:
     problem: Problem
     step: int = 0
     is_due: bool = False  # a round of parking
-    noise: Array = field(default_factory=lambda: np.zeros((3, 2)))  # (n, 2), what the last motion added to the errors
+    noise: Array = field(default_factory=lambda: np.zeros((3, 2)))  # (3, k), added to the pose by the last motion
     places: dict[int, int] = field(default_factory=dict)  # offset of each landmark by label
     seen: dict[int, int] = field(default_factory=dict)  # step at which each was seen last
     parked: dict[int, int] = field(default_factory=dict)  # number of the clone at which a landmark is parked, by label
@@ -89,6 +89,12 @@ def shifts_of(state: CentredState) -> Array:
     T = np.eye(len(state.x))
     T[:3, :3] = shift_matrix(state.x[:3])
     return T
+
+
+def turn_variance(state: CentredState, label: int) -> float:
+    """Variance, rad^2, of the turn since the clone at which a landmark is parked."""
+    P, clone = state.P, state.clones[state.parked[label]] + 2
+    return float(P[2, 2] + P[clone, clone] - 2.0 * P[2, clone])
 
 
 def clone_of(state: CentredState, number: int) -> tuple[slice, Array, Array]:

@@ -62,7 +62,7 @@ DECIDED_CLEARED = {
     ("10 % x6", 3): 0.05,
     ("10 % x6", 6): 0.05,
     ("lognormal", 3): 0.05,
-    ("5 % x11", 6): 0.05,
+    ("5 % x11", 6): 0.13,
 }
 FEW = {(15, 30): (0.08, 0.25), (6, 31): (0.08, 0.2)}  # n and runs of a plan: rates reached with 10 % x6, and 5 % x11
 BLOCKS = {

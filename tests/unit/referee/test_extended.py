@@ -160,7 +160,7 @@ def test_what_does_not_fit_is_named(key, value, said, tmp_path):
 def test_the_error_has_to_be_declared(options, tmp_path):
     arrays, _, P = states("left")
     with pytest.raises(
-        cs.InputError, match="whose error is not known; add --error so3, .*, rvec, euler, additive: left"
+        cs.InputError, match=r"whose error is not known; add --error so3, .*, rvec, euler, additive: left"
     ):
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
 

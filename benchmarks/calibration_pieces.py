@@ -61,6 +61,10 @@ def applied(pose: Array, e: Array, convention: str) -> Array:
     """The true pose (7,) whose error is e, to first order."""
     R, turn = Rotation.from_quat(pose[3:]), Rotation.from_rotvec(e[3:])
     true = turn * R if convention in ("so3", "right") else R * turn
+    if convention == "rvec":
+        true = Rotation.from_rotvec(R.as_rotvec() + e[3:])
+    elif convention == "euler":
+        true = Rotation.from_euler("ZYX", R.as_euler("ZYX") + e[:2:-1])
     at = {"left": pose[:3] + R.apply(e[:3]), "right": turn.apply(pose[:3]) + e[:3]}.get(convention, pose[:3] + e[:3])
     return np.append(at, true.as_quat())
 

@@ -12,7 +12,6 @@ import typer
 from consistency.commands.registry import HELP, CommandGroup
 from consistency.referee.errors import InputError
 from consistency.referee.extras import explained
-from consistency.referee.system.atomic import FULL
 
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 Abort: Any = typer.Abort
@@ -79,6 +78,8 @@ def _run(arguments: list[str] | None) -> Any:
         _drop_output()
         sys.exit(141)
     except OSError as error:
+        from consistency.referee.system.atomic import FULL
+
         if error.filename is None and error.errno not in FULL:
             raise
         fault = "output cannot be written" if error.filename is None else f"{error.filename}: cannot be used"

@@ -16,14 +16,12 @@ from consistency.referee.diagnostics.statistics.nees import e_processes, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import RejectionScore
 from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
-from consistency.referee.diagnostics.words.same_truth import same_truth
 from consistency.referee.diagnostics.words.sentences import (
     details,
     other_ways,
     reasons,
     sentences_of_conventions,
 )
-from consistency.referee.diagnostics.words.stated_level import level_causes
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning.early_stopping import Design
@@ -117,10 +115,10 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
     left_out = set(found.left_out_steps)
     if judged.align:
         left_out.update(judged.left_out_steps)
-    causes = (*judged.causes, *_causes_of_innovations(judged, found)) or tuple(level_causes(found))
+    causes = (*judged.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
     return _verdict(
         found,
-        [sentence, *figures, *causes, *same_truth(judged, found), *other_ways(found.status, judged)],
+        [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)],
         left_out_steps=tuple(sorted(left_out)),
         convention=convention,
         align=align,
@@ -128,6 +126,24 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
         causes=causes,
         **beside,
     )
+
+
+def _causes_of_level(found: Findings) -> list[str]:
+    """Usual levels that would explain a covariance that is too large; their module is loaded for it."""
+    if found.status != "conservative":
+        return []
+    from consistency.referee.diagnostics.words.stated_level import level_causes
+
+    return level_causes(found)
+
+
+def _same_truth(record: Record, found: Findings) -> list[str]:
+    """That all runs have the same truth; its module is loaded where errors are smaller than stated in some step."""
+    if found.location is None or not found.location.steps_below:
+        return []
+    from consistency.referee.diagnostics.words.same_truth import same_truth
+
+    return same_truth(record, found)
 
 
 def _causes_of_innovations(record: Record, found: Findings) -> list[str]:

@@ -151,7 +151,7 @@ def fit_runs(record: Record, blocks: tuple[Block, ...], fits: int = 1) -> Fit:
     """Fit a factor to each block of two runs or more, and a floor where the held-out log score of runs asks for it.
 
     Each run has a step that counts. Where factor and floor can be told apart, the intervals are those of the model with
-    both. All of several ``fits`` together have a floor by chance as seldom as one.
+    both. All of several ``fits`` together have a floor by chance no more often than one.
     """
     alone = fit_alone(record, blocks)
     free, notes = [], []

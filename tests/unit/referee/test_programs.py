@@ -179,7 +179,7 @@ def test_a_recorded_file_needs_its_option(part, place, capsys):
     (place / "out").mkdir()  # an empty folder is taken
     with pytest.raises(SystemExit):
         main(["monte-carlo", "--out", "out", "--", "./filter", "{run}"])
-    assert "named by --state A,B" in capsys.readouterr().err
+    assert "as its covariance P_* says" in capsys.readouterr().err
 
 
 def test_windows_is_refused_in_one_line(place, capsys, monkeypatch):

@@ -561,7 +561,7 @@ def test_by_hand(detect, allow):
     while chi_square_power(runs * test.effective_dof, detect, tail) < power:
         runs += 1
     plan = pilot_plan(means, dof, 60, detect, false_alarm, power, allow)
-    assert plan.runs == max(20, int(np.ceil(1.15 * runs)))
+    assert plan.runs == max(30, int(np.ceil(1.15 * runs)))
     assert plan.pilot_runs == 40
     assert plan.effective_dof == pytest.approx(test.effective_dof)
     assert plan.standard_error == pytest.approx(np.sqrt(2.0 / test.spread))

@@ -332,7 +332,7 @@ def test_a_covariance_of_the_truth_that_is_none_is_refused():
     bad = np.broadcast_to(np.diag([1.0, -1.0]), (2, 3, 2, 2))
     with pytest.raises(cs.InputError, match="covariance of the truth in run 0, step 1 is not a covariance"):
         cs.judge(e, S, truth_covariances=bad)
-    with pytest.raises(cs.InputError, match="'truth_covariances' has shape"):
+    with pytest.raises(cs.InputError, match="truth_covariances has shape"):
         cs.judge(e, S, truth_covariances=np.ones((2, 3, 1, 1)))
 
 

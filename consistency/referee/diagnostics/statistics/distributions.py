@@ -162,6 +162,9 @@ def combined_p_value(p_values: Sequence[float], weights: Sequence[float]) -> flo
     return float(np.arctan2(1.0, np.dot(weights, 1.0 / np.tan(np.pi * p))) / np.pi)
 
 
+FARTHEST = 1e6  # times the largest weight: the tail beyond it is 0 in floating point
+
+
 def weighted_chi_square_tail(value: float, weights: Array) -> float:
     """P(sum of weights times independent chi-square(1) > value) by saddlepoint, ``weights`` (k,) not negative.
 
@@ -169,7 +172,7 @@ def weighted_chi_square_tail(value: float, weights: Array) -> float:
     in the tail too. Up to the mean, and so near to it that differences would be lost in rounding, 1.
     """
     weights = weights[weights > 0]
-    if not np.isfinite(value):
+    if not value < FARTHEST * weights.max(initial=0.0):
         return 0.0
     if value <= weights.sum() + 0.01 * np.sqrt(2.0 * np.square(weights).sum()):
         return 1.0

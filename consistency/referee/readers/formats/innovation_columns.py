@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.innovations import nis_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.columns import Entries, entries_of
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, NIS_DOF, TableRows, are_dof
@@ -99,6 +98,8 @@ def _with_innovations(sheet: TableRows, places: Mapping[str, int], dof: int | No
             S[:, i, j] = column
             if (j, i) not in stated.places:
                 S[:, j, i] = column
+        from consistency.referee.diagnostics.questions.innovations import nis_of
+
         nis, degrees = nis_of(v, S)
         alone = ""
         refuse(np.isfinite(v).all(axis=1) & np.isnan(nis), sheet.place, "the innovation covariance is not positive "

@@ -17,7 +17,6 @@ from consistency.referee.readers.formats import table_columns as columns
 from consistency.referee.readers.formats.columns import covariance_columns, is_pose
 from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
 from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
-from consistency.referee.readers.formats.innovation_columns import with_nis
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
@@ -82,8 +81,12 @@ def _both(
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
-    sheet, of_nis = with_nis(sheet, r.dof, required=truth is None and columns.true_columns(sheet, axes) is None)
-    notes += by_name, of_nis
+    notes.append(by_name)
+    if r.dof is not None or any(word in name.lower() for name in sheet.data for word in ("nis", "innov")):
+        from consistency.referee.readers.formats.innovation_columns import with_nis
+
+        sheet, of_nis = with_nis(sheet, r.dof, required=truth is None and columns.true_columns(sheet, axes) is None)
+        notes.append(of_nis)
     by_step = "step" in sheet and (truth is None or "step" in truth)
     if not by_step or r.time_offset is not None or r.max_dt is not None:
         sheet = columns.with_clock(sheet)

@@ -13,9 +13,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
 from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
-from consistency.referee.readers.formats.innovation_columns import with_nis
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, CsvTable, TableRows, checked_dof, read_sheet
-from consistency.referee.readers.formats.table_columns import row_order, with_clock
+from consistency.referee.readers.formats.table_columns import row_order, with_clock, with_nis
 from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import listed

@@ -81,12 +81,9 @@ def _both(
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
-    notes.append(by_name)
-    if r.dof is not None or any(word in name.lower() for name in sheet.data for word in ("nis", "innov")):
-        from consistency.referee.readers.formats.innovation_columns import with_nis
-
-        sheet, of_nis = with_nis(sheet, r.dof, required=truth is None and columns.true_columns(sheet, axes) is None)
-        notes.append(of_nis)
+    is_alone = truth is None and columns.true_columns(sheet, axes) is None
+    sheet, of_nis = columns.with_nis(sheet, r.dof, required=is_alone)
+    notes += by_name, of_nis
     by_step = "step" in sheet and (truth is None or "step" in truth)
     if not by_step or r.time_offset is not None or r.max_dt is not None:
         sheet = columns.with_clock(sheet)

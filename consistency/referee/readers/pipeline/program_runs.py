@@ -26,8 +26,8 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.readers.formats.file_head import head_of
 from consistency.referee.readers.formats.file_kinds import TRAJECTORIES
-from consistency.referee.readers.formats.innovation_columns import has_nis
 from consistency.referee.readers.formats.spellings import TRUE, stem_of
+from consistency.referee.readers.formats.table_columns import has_nis
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.pipeline.run_folders import NUMBERS, keep_numbers, kept_numbers, merged

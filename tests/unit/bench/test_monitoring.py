@@ -102,7 +102,10 @@ def test_an_archive(tmp_path):
 @pytest.mark.parametrize(
     "arrays, said",
     [
-        ({"nis": NIS}, "'nis_dof' is missing; needed are nis and nis_dof, there are: nis"),
+        (
+            {"nis": NIS},
+            "'nis_dof' is missing; needed are nis and nis_dof, or innovation and innovation_variance, there are: nis",
+        ),
         ({"nis": ["a"], "nis_dof": [1]}, "key 'nis' holds <U1, not numbers"),
         ({"nis": np.zeros((1, 2, 3)), "nis_dof": 1}, r"key 'nis' has shape \(1, 2, 3\), needs"),
         ({"nis": [], "nis_dof": 1}, "key 'nis' has shape"),
@@ -220,7 +223,7 @@ def test_lines_are_judged_as_they_come():
     "text, said",
     [
         ("", "stdin: is empty"),
-        ("nis,dof\n1,2\n", "stdin: 'nis_dof' is missing"),
+        ("nis,other\n1,2\n", "stdin: column 'nis_dof' is missing beside 'nis'"),
         ("nis,nis_dof,run\n1,2,0\n", "column 'run': lines as they come must be of one run"),
         ("nis,nis_dof\n1,2\n1\n", "stdin, line 3: has 1 columns, the header has 2"),
         ("nis,nis_dof\n1,2\n1,x\n", r"stdin, line 3: column 'nis_dof': not a number \(x\)"),

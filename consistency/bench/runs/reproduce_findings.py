@@ -170,7 +170,7 @@ def reproduce(
 
 
 def left_out(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """Experiments of which there is no finding, each with the keys :data:`NOT_RUN`."""
+    """Experiments without a finding, each with the keys :data:`NOT_RUN`."""
     ids = {finding.id for finding in findings}
     return [
         dict(zip(NOT_RUN, (name, first_line_of(module), ", ".join(module.FINDINGS), _how(name, module)), strict=True))

@@ -212,7 +212,7 @@ def is_out_of_sight(label: int, local: Clones) -> bool:
 
 @inner
 def forget(label: int, state: State, local: Clones) -> None:
-    """A landmark in use is no longer in the state, but for its place."""
+    """Take a landmark in use out of the state, and keep its place for when it is seen again."""
     o = state.offset[label]
     clear(o, state, local)
     state.offset[label] = -1 - o

@@ -27,7 +27,7 @@ class Command(threading.Thread):
     def run(self) -> None:
         gc.set_threshold(50_000, 20, 100)  # most of what is made lives as long as the modules that are imported
         for stream in (sys.stdout, sys.stderr):
-            with suppress(AttributeError):  # of a stream that is closed
+            with suppress(AttributeError, OSError):  # of a stream that is closed, or that nobody reads
                 stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # of a locale without Unicode
         from consistency.commands import main  # slow to load
 

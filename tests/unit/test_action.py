@@ -275,7 +275,7 @@ def test_what_fails_the_job(
 def test_a_cell_of_the_summary_cannot_break_the_table(gate):
     row = gate.Row("test[a|b]", "failed", "", "1", "<img src=x>\nand `code` & more")
     line = gate.markdown("fail", [row]).splitlines()[4]
-    assert line == "| test[a\\|b] | failed |  | 1 | &lt;img src=x> and \\`code\\` &amp; more |"
+    assert line == "| test\\[a\\|b] | failed |  | 1 | &lt;img src=x> and \\`code\\` &amp; more |"
 
 
 def test_names_are_no_commands_of_the_runner(gate, tmp_path, monkeypatch, capfd):

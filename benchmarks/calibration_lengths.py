@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from calibration_cases import DETECT, FALSE_ALARM, POWER
+from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
 from calibration_gates import row, shared
 
-from consistency.diagnostics import Record, Settings, gate_runs, judge
+from consistency.diagnostics import Record, Settings, follow, gate_runs, judge, sequential_design
 from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.groups_by_column import column_of, groups_of
@@ -24,7 +24,7 @@ from consistency.referee.fit_covariance.correct import are_needed, fit_groups
 from consistency.referee.fit_covariance.factors import blocks_of
 from consistency.referee.types import Array
 
-GATES, FITS, CLEARS = 2000, 500, 400
+GATES, FITS, CLEARS = 2000, 2000, 400
 QUICK_GATES, QUICK_FITS, QUICK_CLEARS = 50, 20, 20
 STEPS, RARE = 100, 1e-3
 PROCESS = 0.1  # variance of the process noise in a step, over that of the measurement
@@ -32,6 +32,7 @@ FAR = {1: 3.84, 2: 5.99}  # NIS that 5 % exceed, by its dimension
 WHOLE, BETS = "measured ends, false alarm", "measured ends, until decided"
 FACTOR, GROUPED = "measured ends, a factor needed", "groups of unlike runs, false alarm"
 POWERED, CLEARED = "unlike lengths, power", "unlike lengths, all-clear"
+SOON = "unlike lengths, until decided, all-clear"
 
 Ends = Callable[[Array], Array]  # innovations (R, T, n) over their deviations -> steps (R, T) that a run has
 
@@ -115,6 +116,7 @@ LENGTHS: dict[str, Lengths] = {
     "1 to 100": lambda rng, runs: rng.integers(1, STEPS + 1, runs),
     "10 % ten times": lambda rng, runs: np.where(rng.random(runs) < 0.1, STEPS, STEPS // 10),
 }
+LOOK = 192  # runs at a look
 REACHED, SHOWN = 0.93, 0.9  # power at DETECT, which the plan approximates, and right filters called consistent
 ABOUT = {
     **{world: of.about for world, of in WORLDS.items()},
@@ -131,6 +133,7 @@ ABOUT = {
     GROUPED: "a right filter with one error in all steps of a run is found at fault with `--by`",
     POWERED: "a covariance wrong by the ratio is found with the runs of `plan`, lengths depending on nothing",
     CLEARED: "a right filter is called consistent with 100 runs, lengths depending on nothing",
+    SOON: "`--until-decided` calls a right filter consistent after 192 runs at most, lengths depending on nothing",
 }
 
 
@@ -142,6 +145,7 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
         *_grouped(quick, seed),
         *_power(quick, seed),
         *_cleared(quick, seed),
+        *_soon(quick, seed),
     ]
 
 
@@ -189,7 +193,9 @@ def _bets(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
             for _ in range(gates):
                 sample = sample_of(measured(rng, WORLDS[world], 300), Settings())
                 assert sample is not None
-                found.append(max(ever(bets.both) for bets in e_processes(sample.means(), sample.dof, sample.shares)))
+                found.append(
+                    max(ever(bets.both) for bets in e_processes(sample.means(), sample.dof, sample.early_means))
+                )
             share = SHARES[MAIN]
             rates = {share * rate: share * rate for rate in (FALSE_ALARM, RARE)}
             yield from counted(world, BETS, 300, rates, found)
@@ -264,3 +270,13 @@ def _cleared(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng((seed, 137, k))
         found = sum(judge(_of_lengths(rng, lengths, 100, 1.0), settings).consistent for _ in range(gates))
         yield row(world, CLEARED, 1.0, 100, SHOWN, ">=", gates, found)
+
+
+def _soon(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
+    gates, design = QUICK_CLEARS if quick else CLEARS, sequential_design(3, DETECT, FALSE_ALARM, POWER, MOST)
+    for k, (world, lengths) in enumerate(LENGTHS.items()):
+        rng, found = np.random.default_rng((seed, 138, k)), 0
+        for _ in range(gates):
+            verdict, runs = follow(design, _of_lengths(rng, lengths, MOST, 1.0).first_runs)
+            found += verdict.consistent and runs <= LOOK
+        yield row(world, SOON, 1.0, LOOK, SHOWN, ">=", gates, found)

@@ -331,7 +331,7 @@ def _p_of_scale(design: Design, evidence: Record) -> list[float]:
     sample = sample_of(evidence, design.settings)
     if sample is None:
         return [1.0]
-    return [ever(bets.both) for bets in e_processes(sample.means(), sample.dof, sample.shares)]
+    return [ever(bets.both) for bets in e_processes(sample.means(), sample.dof, sample.early_means)]
 
 
 def progress_text(decided: Mapping[str, Verdict], filters: Sequence[str]) -> str:

@@ -936,6 +936,27 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
     assert_array_equal(band.get_ydata(), common.simultaneous[:, 0])
 
 
+def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(report):
+    (study,) = report.studies
+    track = study.tracks[0]
+    nees = track.record().nees.copy()
+    nees[[0, 2]] *= 1e4
+    scale = replace(track.verdict.scale, median_run=2.5, worst_run=3e4, mean_anees=4321.0)
+    verdict = replace(track.verdict, scale=scale)
+    far = replace(track, verdict=verdict, record=lambda: replace(track.record(), nees=nees))
+    changed = replace(study, tracks=(far, *study.tracks[1:]))
+    curves = anees.read(changed).curves
+    assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
+    others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
+    assert_allclose(curves[0].others, others.filled(np.nan))
+    (figure,) = anees.anees_curves(changed)
+    assert f" 2 runs of {verdict.runs} decide the average of {track.name}, 4321 over all steps" in figure.caption
+    (axes,) = panels(figure)
+    (thin,) = lines(axes, f"{track.name} without 2 runs")
+    assert_array_equal(thin.get_ydata(), curves[0].others)
+    assert "decide" not in anees.anees_caption(anees.read(study))
+
+
 def test_pose_errors_have_a_row_for_each_filter(report):
     (study,) = report.studies
     figure = by_title(compose(report))["Pose errors, run 0"]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from consistency.diagnostics import Record, Settings, judge, look, sequential_design, speaks, spread_steps
+from consistency.diagnostics import Record, Settings, follow, judge, look, sequential_design, speaks, spread_steps
 from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.equivalence import equivalence_by_betting
@@ -21,7 +21,7 @@ from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import RunMeans, ratio_interval, scale_test
 from consistency.referee.diagnostics.questions.shape import mean_shape, products_test
 from consistency.referee.diagnostics.statistics.distributions import combined_p_value
-from consistency.referee.diagnostics.statistics.nees import e_process, e_processes, ever
+from consistency.referee.diagnostics.statistics.nees import EarlyMeans, e_process, e_processes, ever
 from consistency.referee.diagnostics.verdict.answers import MAIN, answers, named_p_values
 
 SURE = 1e-4
@@ -50,7 +50,7 @@ def test_runs_of_equal_length_have_one_test():
     assert both.find(1.3) == both.name(1.3) == scale_test(means / 1.3, 2, 7)
     assert both.interval(0.9) == ratio_interval(means, 2, 0.9)
     sample = sample_of(Record("equal", nees=np.random.default_rng(94).chisquare(2, (30, 5)), dof=2), Settings())
-    assert sample.shares is None
+    assert sample.early_means is None
     assert sample.run_means().early is None
     assert run_tests(sample, Settings(), {}).named == {}
 
@@ -191,23 +191,55 @@ def test_what_is_accepted_holds_a_mean_that_is_no_fault():
 # --- growing numbers of runs -----------------------------------------------------------------------------------
 
 
-def test_bets_are_weighted_by_the_share_of_steps():
-    means, shares = np.array([1.4, 0.2, 3.0]), np.array([1.0, 0.5, 0.1])
-    first, second = e_processes(means, 2, shares)
-    assert first.up.tolist() == e_process(means, 2).up.tolist()
-    assert second.up.tolist() == e_process(np.array([1.4, 0.6, 1.2]), 2).up.tolist()
+def test_early_steps_weigh_more_in_bets():
+    nees = 2.0 * np.array([[np.nan, 1.0, 2.0, 4.0], [np.nan, 3.0, np.nan, np.nan], [np.nan, np.nan, 5.0, np.nan]])
+    early = sample_of(Record("early", nees=nees, dof=2), Settings()).early_means
+    total = 1.0 + 1.0 / 2.0 + 1.0 / 3.0
+    assert early.shares == pytest.approx([1.0, 1.0 / total, 0.5 / total])
+    assert early.means == pytest.approx([(1.0 + 2.0 / 2.0 + 4.0 / 3.0) / total, 3.0, 5.0])
+
+
+def test_bets_are_on_the_share_that_a_run_has():
+    means, early = np.array([1.4, 0.2, 3.0]), EarlyMeans(np.array([1.4, 0.4, 2.0]), np.array([1.0, 0.5, 0.1]))
+    first, second = e_processes(means, 2, early, 2.0)
+    assert first.up.tolist() == e_process(means / 2.0, 2).up.tolist()
+    assert second.up == pytest.approx(e_process(np.array([0.7, 0.6, 1.0]), 2).up)
     assert len(e_processes(means, 2)) == 1
     settings = Settings()
-    found = equivalence_by_betting(means, 2, settings, shares)
-    worst = max(ever(each.down) for each in e_processes(means / settings.factor, 2, shares))
-    assert found.p_value == max(worst, max(ever(each.up) for each in e_processes(means * settings.factor, 2, shares)))
+    found = equivalence_by_betting(means, 2, settings, early)
+    worst = max(ever(each.down) for each in e_processes(means, 2, early, settings.factor))
+    above = max(ever(each.up) for each in e_processes(means, 2, early, 1.0 / settings.factor))
+    assert found.p_value == max(worst, above)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])
+def test_a_bet_has_the_mean_1_where_a_share_of_the_steps_is_there(share):
+    """One step of the run, or none: its factor has the mean 1 exactly if the share is that of a whole run.
+
+    With a part of the steps, all of them equal, it has a mean of at most 1.
+    """
+    y = stats.chi2.ppf((np.arange(1000) + 0.5) / 1000, 3) / 3.0
+    down = np.array([e_process(np.array([mean]), 3, np.array([share])).down[0] for mean in y])
+    assert down.mean() < 1.0 + 1e-3
+    if share in (0.0, 1.0):
+        assert down.mean() == pytest.approx(1.0, abs=1e-3)
+    whole, absent = (e_process(np.array([2.0]), 3, np.array([part])).down[0] for part in (1.0, 0.0))
+    assert whole < absent == pytest.approx(1.0)
 
 
 def test_the_e_process_of_a_right_filter_does_not_grow_by_how_its_runs_end():
     sample = sample_in("gives up", 6000)
-    first, second = e_processes(sample.means(), 1, sample.shares)
+    first, second = e_processes(sample.means(), 1, sample.early_means)
     assert ever(first.both) < SURE
     assert ever(second.both) > SURE
+
+
+def test_a_right_filter_with_few_long_runs_is_soon_called_consistent():
+    rng = np.random.default_rng(138)
+    record = lengths._of_lengths(rng, lengths.LENGTHS["10 % ten times"], 400, 1.0)
+    verdict, runs = follow(sequential_design(3, max_runs=400), record.first_runs)
+    assert verdict.consistent
+    assert runs <= 200
 
 
 def test_no_look_finds_a_scale_wrong_by_how_runs_end():
@@ -270,4 +302,4 @@ def test_worlds_have_the_mean_of_their_covariance_by_steps_alone(world):
     sample = sample_in(world, 1500)
     excess = np.nansum(sample.nees - sample.dof, axis=1)
     assert abs(excess.mean()) < 6.0 * excess.std() / np.sqrt(len(excess))
-    assert sample.shares is not None
+    assert sample.early_means is not None

@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
+from consistency.referee.diagnostics.questions.scale import run_means
+from consistency.referee.diagnostics.records.whitening import mean_and_count
 from consistency.referee.diagnostics.verdict.answers import STEP
+from consistency.referee.diagnostics.verdict.parts import Scale
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import names_in_a_row
+from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
+from consistency.referee.diagnostics.words.sentences import SPREAD
 from consistency.referee.document.blocks import Figure
 from consistency.referee.document.colours import EXPECTED, LIMIT
 from consistency.referee.pages.judged_estimators import wide
@@ -33,6 +37,8 @@ class Curve:
     band: Array  # (T, 2), where the ANEES of a consistent filter lies in one step
     simultaneous: Array | None  # (T, 2), where it lies in all steps at once
     own_band: bool  # failed runs, or an earlier decision, have made the bands differ from those of the study
+    others: Array | None  # (T,), without the runs that decide the average; None where there are none
+    far: int  # number of these runs
 
     @property
     def expected(self) -> float:
@@ -69,7 +75,19 @@ def _curve(track: Track, shared: Verdict | None) -> Curve:
     scale, location = track.verdict.scale, track.verdict.location
     assert scale is not None
     simultaneous = None if location is None else location.simultaneous
-    return Curve(track, scale.anees, scale.band, simultaneous, _fewer(track.verdict, shared))
+    others, far = _without_far_runs(track, scale)
+    return Curve(track, scale.anees, scale.band, simultaneous, _fewer(track.verdict, shared), others, far)
+
+
+def _without_far_runs(track: Track, scale: Scale) -> tuple[Array | None, int]:
+    """ANEES (T,) without the runs that are far from the median run, and how many those are."""
+    if not scale.worst_run > SPREAD * scale.median_run:
+        return None, 0
+    nees = track.record().first_runs(track.verdict.runs).nees
+    assert nees is not None
+    means, _ = run_means(nees)
+    far = means > SPREAD * scale.median_run
+    return mean_and_count(nees[~far], 0)[0], int(far.sum())
 
 
 def common(verdicts: dict[str, Verdict]) -> Verdict | None:
@@ -99,6 +117,9 @@ def anees_curves(study: Study) -> tuple[Figure, ...]:
         for curve_of in anees.curves:
             track = curve_of.track
             curve(axes, study.clock.values, curve_of.values, track.look, track.name, track.tag)
+            if curve_of.others is not None:
+                label = f"{track.name} without {plural(curve_of.far, 'run')}"
+                curve(axes, study.clock.values, curve_of.others, replace(track.look, width=0.7), label, track.tag)
         axes.set_ylabel(name)
         study.clock.span(axes)
         if anees.log:
@@ -138,6 +159,20 @@ def anees_caption(anees: Anees) -> str:
     return (
         f"{what}; {expected} is expected (line). Shaded: the 95 % band of a single step (eq. 17), which is not judged."
         f"{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
+        f"{''.join(map(_told, anees.curves))}"
+    )
+
+
+def _told(curve_of: Curve) -> str:
+    """Which runs decide the average of a filter."""
+    scale = curve_of.track.verdict.scale
+    if not curve_of.far or scale is None:
+        return ""
+    return (
+        f" {plural(curve_of.far, 'run')} of {curve_of.track.verdict.runs} decide"
+        f"{'s' if curve_of.far == 1 else ''} the average of {curve_of.track.name}, {short(scale.mean_anees)} over all "
+        f"steps: {short(scale.worst_run)} in the worst run and {short(scale.median_run)} in the median run. Thin: "
+        f"without {'it' if curve_of.far == 1 else 'them'}."
     )
 
 

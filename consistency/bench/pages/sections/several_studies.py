@@ -21,6 +21,7 @@ from consistency.referee.document.blocks import (
     Figure,
     Heading,
     Name,
+    Quantity,
     Reasons,
     Settings,
     Table,
@@ -28,7 +29,7 @@ from consistency.referee.document.blocks import (
     table,
 )
 from consistency.referee.document.colours import BAND, EXPECTED, solid
-from consistency.referee.document.judged_filters import BRIEF, cells, columns
+from consistency.referee.document.judged_filters import BRIEF, Measure, cells, columns
 from consistency.referee.pages.manifest_facts import facts
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
@@ -47,11 +48,14 @@ ORIGIN = ("Command", "Date", "Git commit", "Runs", "Seed")  # facts on the first
 ON_PAPER = ("ANEES of the pose", "NEES of the pose")  # figures of a study
 LABEL = "covariance ratio (truth / stated)"
 ROOM = 1.5  # factor between the outermost values and the edges of the picture
-WIDTHS = ("0.9fr", "auto", "auto")
+WIDTHS = ("0.9fr", "auto", "auto", "auto")
+VERDICT, ANEES, RATIO = BRIEF
+MEDIAN = Measure(Column("Median run", number=True), lambda v: Quantity(None if v.scale is None else v.scale.median_run))
+MEASURES = (VERDICT, ANEES, MEDIAN, RATIO)
 COLUMNS = (
     Column("World", width="1.6fr"),
     Column("Filter", width="1fr"),
-    *(replace(column, paper="", width=width) for column, width in zip(columns(BRIEF), WIDTHS, strict=True)),
+    *(replace(column, paper="", width=width) for column, width in zip(columns(MEASURES), WIDTHS, strict=True)),
 )
 
 
@@ -127,11 +131,14 @@ def _baseline(study: Study) -> str:
 
 def _table(report: Report) -> Table:
     rows = [
-        (study.name, Name(track.name, track.look), *cells(BRIEF, track.verdict))
+        (study.name, Name(track.name, track.look), *cells(MEASURES, track.verdict))
         for study in report.studies
         for track in study.tracks
     ]
-    caption = "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane."
+    caption = (
+        "Every verdict of this report; a right filter has a mean ANEES of 3 for a pose in the plane. Where that is far "
+        "above the mean NEES of the median run, few runs decide it."
+    )
     return table(COLUMNS, rows, "Verdicts of all studies", caption=caption, style="narrow")
 
 

@@ -275,7 +275,7 @@ def _equivalence(
     )
     if inspection is None:
         return shown
-    return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings, sample.shares)))
+    return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings, sample.early_means)))
 
 
 def _early_ends(sample: Sample) -> EarlyEnds | None:

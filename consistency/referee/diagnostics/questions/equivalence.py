@@ -10,7 +10,7 @@ from scipy import special
 
 from consistency.referee.diagnostics.questions.scale import FEW, MeanTest, scale_test
 from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.nees import e_processes, ever
+from consistency.referee.diagnostics.statistics.nees import EarlyMeans, e_processes, ever
 from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
 from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES, Settings
 from consistency.referee.diagnostics.verdict.parts import Equivalence
@@ -126,21 +126,21 @@ def _end(p_value: Callable[[float], float], ratio: float, sign: float, level: fl
     return ratio * float(np.exp(sign * outside))
 
 
-def equivalence_by_betting(means: Array, dof: int, settings: Settings, shares: Array | None = None) -> Equivalence:
+def equivalence_by_betting(means: Array, dof: int, settings: Settings, early: EarlyMeans | None = None) -> Equivalence:
     """Equivalence of the scale from the inverted e-process: valid at any look, and under any dependence.
 
     Parameters
     ----------
     means : (runs,), mean over its steps of each run's NEES over ``dof``
     dof : components of the error
-    shares : (runs,), see :func:`e_processes`; None where runs have equally many steps
+    early : see :func:`e_processes`; None where runs have equally many steps
     """
 
     def below(ratio: float) -> float:
-        return max(ever(bets.down) for bets in e_processes(means / ratio, dof, shares))
+        return max(ever(bets.down) for bets in e_processes(means, dof, early, ratio))
 
     def above(ratio: float) -> float:
-        return max(ever(bets.up) for bets in e_processes(means / ratio, dof, shares))
+        return max(ever(bets.up) for bets in e_processes(means, dof, early, ratio))
 
     mean = float("nan")
     if len(means):

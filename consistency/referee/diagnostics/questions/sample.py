@@ -20,6 +20,7 @@ from consistency.referee.diagnostics.records.whitening import (
     whiten,
     whiten_group,
 )
+from consistency.referee.diagnostics.statistics.nees import EarlyMeans
 from consistency.referee.diagnostics.verdict.answers import Settings
 from consistency.referee.types import Array, Indices
 
@@ -148,11 +149,20 @@ class Sample:
         return int(self.counts.max(initial=0))
 
     @property
-    def shares(self) -> Array | None:
-        """Part of all steps that each run has, (runs,); None where all runs have equally many."""
+    def early_means(self) -> EarlyMeans | None:
+        """Means in which early steps weigh more; None where all runs have equally many steps."""
         if not are_unlike(self.counts):
             return None
-        return np.asarray(self.counts / self.nees.shape[1])
+        weights = np.zeros(self.nees.shape[1])
+        first = int(self.counted.any(axis=0).argmax())  # a skipped start has no weight
+        weights[first:] = 1.0 / np.arange(1.0, len(weights) - first + 1.0)
+
+        def of_block(nees: Array, counted: Array) -> Array:
+            return np.stack([np.where(counted, nees, 0.0) @ weights, counted @ weights], axis=-1)
+
+        total, weight = by_runs(of_block, self.nees, self.counted).T
+        total, weight = total[weight > 0], weight[weight > 0]
+        return EarlyMeans(total / weight / self.dof, weight / weights.sum())
 
     def group_means(self, index: Sequence[int], steps: slice = slice(None), centre: Centre | None = None) -> Array:
         """Mean NEES of a group of components alone, of errors about the ``centre``, over its number of components."""

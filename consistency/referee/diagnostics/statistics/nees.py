@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -184,8 +184,8 @@ class EProcess:
         return np.asarray(0.5 * (self.up + self.down))
 
 
-def e_process(means: Array, dof: int | Array) -> EProcess:
-    """E-process on run means Y_i of the NEES over its degrees of freedom.
+def e_process(means: Array, dof: int | Array, shares: Array | None = None) -> EProcess:
+    """E-process on run means Y_i of the NEES over its degrees of freedom, or on 1 + s_i (Y_i - 1).
 
     Up: the mean over stakes l of prod(1 + l (Y_i - 1)). Down: the mean over l of
     prod(0.98 max(0, 1 - l (Y_i - 1)) / c_l + 0.02), with c_l the mean of max(0, 1 - l (Y - 1)) for
@@ -201,32 +201,46 @@ def e_process(means: Array, dof: int | Array) -> EProcess:
     ----------
     means : (runs,), mean NEES of each run over its degrees of freedom; a run without a value is left out beforehand
     dof : dimension of the error, one number or (runs,)
+    shares : (runs,), s_i, whose factors are 1 - s_i times 1 - f(1) larger, see :func:`e_processes`; None where all are 1
     """
     y = np.asarray(means, float)
+    if shares is not None:
+        y = 1.0 + shares * (y - 1.0)
     n = np.broadcast_to(np.asarray(dof, float), y.shape)[:, None]
     x = n * (1.0 + 1.0 / DOWN)
     expected = (1.0 + DOWN) * special.chdtr(n, x) - DOWN * special.chdtr(n + 2.0, x)
-    gain = np.maximum(0.0, 1.0 - DOWN * (y[:, None] - 1.0))
+    gain = np.maximum(0.0, 1.0 - DOWN * (y[:, None] - 1.0)) / expected
+    if shares is not None:
+        gain += (1.0 - shares[:, None]) * (1.0 - 1.0 / expected)
     with np.errstate(divide="ignore"):  # a run without any error loses all that was staked
         won = np.log1p(UP * (y[:, None] - 1.0))
-    return EProcess(_mixture(won), _mixture(np.log((1.0 - KEPT) * gain / expected + KEPT)))
+    return EProcess(_mixture(won), _mixture(np.log((1.0 - KEPT) * gain + KEPT)))
 
 
-def e_processes(means: Array, dof: int, shares: Array | None = None) -> list[EProcess]:
-    """E-process on run means and, where runs have unlike numbers of steps, another one weighted by these.
+class EarlyMeans(NamedTuple):
+    """Mean NEES of runs in which step k of T has the weight 1 / k, less for later steps, and only if the run has it."""
 
-    With the share s_i of the T steps that run i has, the second bets on 1 + s_i (Y_i - 1), the mean over T steps of the
-    NEES over its degrees of freedom, or 1 in a step that the run does not have. If a right filter states its covariance
-    given what it has measured, and that decides whether a step counts, such a value has the mean 1 and, by Jensen's
-    inequality, factors of :func:`e_process` with a mean of at most 1. A run mean does not have the mean 1 then.
+    means: Array  # (runs,), over the degrees of freedom
+    shares: Array  # (runs,), sum of a run's weights over that of all T steps
+
+
+def e_processes(means: Array, dof: int, early: EarlyMeans | None = None, ratio: float = 1.0) -> list[EProcess]:
+    """E-process on run means and, where runs have unlike numbers of steps, another one on 1 + s_i (Y_i - 1).
+
+    With the means and shares s_i of ``early`` that is the weighted mean over all T steps of the NEES over its degrees
+    of freedom, or 1 in a step that the run does not have. If a right filter states its covariance given what it has
+    measured, and that decides whether a step counts, such a value has the mean 1 and, by Jensen's inequality, factors
+    f of :func:`e_process` with a mean of at most s_i + (1 - s_i) f(1). A run mean does not have the mean 1 then.
 
     Parameters
     ----------
-    shares : (runs,), 1 at most, of a number T that does not depend on the data; None where they are equal
+    means : (runs,), mean NEES of each run over ``dof``
+    early : its T and weights do not depend on the data; None where runs have equally many steps
+    ratio : of true to stated covariance that the processes bet against
     """
-    bets = [e_process(means, dof)]
-    if shares is not None:
-        bets.append(e_process(1.0 + shares * (means - 1.0), dof))
+    bets = [e_process(means / ratio, dof)]
+    if early is not None:
+        bets.append(e_process(early.means / ratio, dof, early.shares))
     return bets
 
 

@@ -1,6 +1,7 @@
 """The experiments on synthetic matches, cut to a few repetitions: all findings come, and their rules can fail."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import scripts
 from scipy import stats
@@ -64,6 +65,22 @@ def test_map(first_order):
     assert study.tables["first_order"].groupby("estimator")["dof"].first().to_dict() == {
         "triangulation": 3, "svd": 6, "horn": 6, "weighted": 6, "reprojection": 6,
     }  # fmt: skip
+
+
+def test_undecided_cells_leave_first_order_open(first_order):
+    """One cell each that is accepted, undecided and at fault: at fault is only the last, and only near it refutes."""
+    assert [first_order.holds(*counts) for counts in ((17, 0, 17), (16, 0, 17), (16, 1, 17))] == [True, None, False]
+    cells = pd.DataFrame({
+        "status": ["consistent", "undecided", "overconfident"], "ratio": [0.01, 0.03, 0.2], "faults": ["", "", "scale"],
+        "mean_nees": [3.0, 3.3, 9.0], "failed": [0, 0, 1], "depth": 3.0, "baseline": 1.0, "noise": 0.25,
+    })  # fmt: skip
+    found = first_order.described(cs.Study(), "triangulation", cells)
+    assert found.verdict == "not shown"
+    assert found.measured.startswith(
+        "accepted in 1 of 2 cells up to 5% (0 at fault) and in 0 of 1 beyond (1), the others undecided; at fault from "
+        "20.0% on, by scale 1"
+    )
+    assert first_order.described(cs.Study(), "svd", cells.assign(ratio=0.01)).verdict == "refuted"
 
 
 def test_the_drawn_band_is_the_rule(figures):

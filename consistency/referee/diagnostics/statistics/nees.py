@@ -201,7 +201,7 @@ def e_process(means: Array, dof: int | Array, shares: Array | None = None) -> EP
     ----------
     means : (runs,), mean NEES of each run over its degrees of freedom; a run without a value is left out beforehand
     dof : dimension of the error, one number or (runs,)
-    shares : (runs,), s_i, whose factors are 1 - s_i times 1 - f(1) larger, see :func:`e_processes`; None where all are 1
+    shares : (runs,), s_i, with which a factor f is larger by (1 - s_i) (1 - f(1)), see :func:`e_processes`; None: all 1
     """
     y = np.asarray(means, float)
     if shares is not None:

@@ -133,8 +133,8 @@ def _show_ratios(
         require_plot(plot, overwrite)
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
+    print_document(ratios_document(path.stem, ratios), as_json)
     if plot is not None:
         from consistency.referee.pages.nis_over_time import monitor_drawing
 
         plotted(partial(monitor_drawing, ratios), plot)
-    print_document(ratios_document(path.stem, ratios), as_json)

@@ -94,13 +94,16 @@ def monitor_command(
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
+    print_document(
+        monitor_document(
+            watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t, min(watched.t, default=0.0)
+        ),
+        as_json,
+    )
     if plot is not None:
         from consistency.referee.pages.nis_over_time import monitor_drawing
 
         plotted(partial(monitor_drawing, watched), plot)
-    print_document(
-        monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t), as_json
-    )
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
 
@@ -130,8 +133,8 @@ def _show_ratios(
         require_plot(plot, overwrite)
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
+    print_document(ratios_document(path.stem, ratios), as_json)
     if plot is not None:
         from consistency.referee.pages.nis_over_time import monitor_drawing
 
         plotted(partial(monitor_drawing, ratios), plot)
-    print_document(ratios_document(path.stem, ratios), as_json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -103,8 +104,12 @@ def monte_carlo_command(
     tell_notes(records)
     tell(failures_in_words(records, out))
     shown = document(verdicts, program.name)
-    print_document(shown, as_json, write_reports(records, verdicts, shown, report, junit, overwrite))
+    print_document(shown, as_json)
+    sys.stdout.flush()  # whatever becomes of the pictures
+    written = write_reports(records, verdicts, shown, report, junit, overwrite)
     if not as_json:
+        for file in written:
+            print(file)
         print_next("runs", out)
     if fail_on is not None and not all(verdict.consistent for verdict in verdicts.values()):
         raise typer.Exit(1)

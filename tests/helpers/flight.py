@@ -3,10 +3,8 @@
 import struct
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 TOPICS = ("estimator_innovations", "estimator_innovation_variances")
-SIGMA = np.array([0.5, 0.4, 0.8, 0.02, 0.02, 0.05])  # of a simulation: north, east, down; rotation about them
 FIELDS = {"gps_hpos": 2, "gps_vpos": 1, "baro_vpos": 1, "mag_field": 3}  # of each topic, floats
 
 
@@ -68,40 +66,3 @@ class Flight:
     def write(self, path):
         path.write_bytes(self.head + self.body)
         return path
-
-
-def simulated(path, states=25, rows=120, origin=None, true_origin=None):
-    """A circling flight with its truth and the variances of the EKF2; the errors (rows, 6)."""
-    rng = np.random.default_rng()
-    t = 0.1 * np.arange(rows)
-    place = np.column_stack([5.0 * np.sin(t), 5.0 * np.cos(t), -10.0 - t])
-    turn = Rotation.from_euler("ZYX", np.column_stack([t, 0.05 * np.sin(t), 0.1 * np.cos(t)]))
-    e = SIGMA * rng.normal(size=(rows, 6))
-    own = Rotation.from_rotvec(-e[:, 3:]) * turn
-    log = Flight()
-    for k in range(rows):
-        stamp = 10**7 + 100_000 * k
-        poses = (("", place[k] - e[k, :3], own[k], origin), ("_groundtruth", place[k], turn[k], true_origin))
-        for ending, p, R, ref in poses:
-            x, y, z, w = R.as_quat()
-            fields = {"timestamp": ("Q", stamp), "q": ("4f", (w, x, y, z))}
-            log.other(f"vehicle_attitude{ending}", fields)
-            fields = {"timestamp": ("Q", stamp), "xy_valid": ("B", int(k > 3 or ending != "")), "z_valid": ("B", 1)}
-            fields |= dict(zip("xyz", (("f", each) for each in p), strict=True))
-            if ref is not None:
-                kinds = {"ref_lat": "d", "ref_lon": "d", "ref_alt": "f"}
-                fields |= {name: (kind, each) for (name, kind), each in zip(kinds.items(), ref, strict=True)}
-            log.other(f"vehicle_local_position{ending}", fields)
-        if k % 10 == 0:
-            variances = np.zeros(24)
-            first = 6 if states == 25 else 7
-            variances[first : first + 3] = SIGMA[:3] ** 2
-            variances[:3] = SIGMA[3:] ** 2
-            if states == 24:  # to first order, d q = (0, rotation vector) q / 2
-                x, y, z, w = own[k].as_quat()
-                G = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
-                variances[:4] = np.diag(G @ np.diag(SIGMA[3:] ** 2) @ G.T)
-            values = {"states": (f"{states}f", np.zeros(states)), "covariances": ("24f", variances)}
-            log.other("estimator_states", {"timestamp": ("Q", stamp)} | values)
-    log.write(path)
-    return e[4:]

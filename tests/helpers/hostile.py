@@ -17,7 +17,7 @@ import pandas as pd
 import tomli_w
 from drives import write_drive, write_states
 from edited import accept_changes
-from flight import Flight, simulated
+from flight import Flight
 from scipy.io import savemat
 
 import consistency as cs
@@ -231,7 +231,6 @@ def _write_recorded(folder):
     for k in range(4 * STEPS):
         log.both(10**6 + 10**4 * k, {"baro_vpos": (rng.standard_normal(), 1.0)})
     log.write(folder / "flight" / "one.ulg")
-    simulated(folder / "flight" / "simulated.ulg", rows=4 * STEPS)
 
 
 def quietly(arguments):
@@ -361,7 +360,6 @@ TARGETS = (
            command("analyse", "{}/state_estimate.txt", "--truth", "{}/state_groundtruth.txt", "--covariance",
                    "{}/state_deviation.txt", "--axes", "x,yaw"), m.ANY | m.TEXT, {}),
     Target("flight", ("one.ulg",), command("monitor", "{}/one.ulg", *OPTIMAL), m.ANY, {}),
-    Target("flight", ("simulated.ulg",), command("analyse", "{}/simulated.ulg"), m.ANY, {}),
     Target("scenario", ("world.toml",), _scenario, TOML, LINE_TWICE),
     Target("sweep", ("sweep.toml", "world.toml"), _sweep, TOML, LINE_TWICE),
     Target("baseline", ("base.json",), command("compare", "{}/base.json"), m.ANY | TREE,

@@ -109,7 +109,7 @@ class Journal:
             for name, columns in parts.items():
                 column_types = json.dumps({column: values.dtype.str for column, values in columns.items()})
                 numbers = b"".join([values.tobytes() for values in columns.values()])
-                part_row = (run, name, column_types, numbers, zlib.crc32(numbers))
+                part_row = (run, name, column_types, numbers, _checksum(run, name, column_types, numbers))
                 database.execute("INSERT OR REPLACE INTO part VALUES (?, ?, ?, ?, ?)", part_row)
             noted_json = json.dumps(dict(notes)) if notes else None
             database.execute("INSERT OR REPLACE INTO finished VALUES (?, ?)", (run, noted_json))
@@ -130,7 +130,7 @@ class Journal:
             if row is None:
                 continue
             column_types, numbers, checksum = row
-            if zlib.crc32(numbers) != checksum:
+            if _checksum(run, name, column_types, numbers) != checksum:
                 raise self._damaged(f"run {run}")
             yield run, _decode(numbers, json.loads(column_types))
 
@@ -166,6 +166,11 @@ class Journal:
 
     def _damaged(self, what: str) -> InputError:
         return InputError(f"{self.path}: damaged ({what}); the same command with --overwrite drops it")
+
+
+def _checksum(run: int, name: str, column_types: str, numbers: bytes) -> int:
+    """CRC-32 of a part with its key, because a damaged index may lead to the row of another run."""
+    return zlib.crc32(numbers, zlib.crc32(f"{run} {name} {column_types}".encode()))
 
 
 def _decode(numbers: bytes, types: Mapping[str, str]) -> Columns:

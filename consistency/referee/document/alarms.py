@@ -8,10 +8,13 @@ import numpy as np
 
 from consistency.referee.diagnostics.monitoring.gate_ratios import RARE, GateRatios
 from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, Alarm, Monitor, accepted_scales
+from consistency.referee.diagnostics.verdict.verdict import CLOCK, MICROSECOND
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 
 
-def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> Document:
+def monitor_document(
+    name: str, monitor: Monitor, alarm: Alarm | None, t: float, since_t: float, start: float = 0.0
+) -> Document:
     """One row of numbers and a sentence, and the numbers as data.
 
     Parameters
@@ -20,6 +23,7 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
     monitor : after the last step
     alarm : its steps as the file numbers them
     t, since_t : s, of the alarm and of the beginning of the fault; NaN where they are not known
+    start : s, the first time of the log; the sentence counts from it where the clock does not begin with the log
     """
     m = monitor
     data = {
@@ -42,10 +46,10 @@ def monitor_document(name: str, monitor: Monitor, alarm: Alarm | None, t: float,
     cells += [("e-value", f"{m.evidence:.3g}"), ("largest", f"{m.largest:.3g}"), ("alarm at", f"{m.threshold:.4g}")]
     columns = (Column("innovations"), *(Column(head, number=True) for head, _ in cells))
     shown = table(columns, [(name, *(cell for _, cell in cells))], f"Monitor of {name}")
-    return Document(name, "", (), (shown, Text(""), Text(_sentence(m, alarm, t, since_t))), data)
+    return Document(name, "", (), (shown, Text(""), Text(_sentence(m, alarm, t, since_t, start))), data)
 
 
-def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -> str:
+def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float, start: float) -> str:
     if alarm is None:
         sentence = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
         if monitor.tolerance > 1.0:
@@ -56,7 +60,11 @@ def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float) -
     else:
         sentence = str(alarm)
         if np.isfinite(t):
-            sentence += f" Alarm at t = {t:.10g} s, since t = {since_t:.10g} s."
+            after = ""
+            if start > CLOCK:
+                t, since_t = np.round([t - start, since_t - start], MICROSECOND)
+                after = " after the start"
+            sentence += f" Alarm at t = {t:.10g} s, since t = {since_t:.10g} s{after}."
     if monitor.gate is not None and monitor.rejections:
         sentence += (
             f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "

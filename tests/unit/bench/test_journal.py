@@ -182,6 +182,16 @@ def test_a_damaged_number_is_refused(path):
     again.close()
 
 
+def test_the_numbers_of_another_run_are_refused(path):
+    journal = Journal(path)
+    fill(journal, 0, 1)
+    journal._database.execute("DELETE FROM part WHERE run = 0")
+    journal._database.execute("UPDATE part SET run = 0 WHERE run = 1")
+    with pytest.raises(cs.InputError, match=r"damaged \(run 0\)"):
+        held(journal)
+    journal.close()
+
+
 def test_a_file_that_is_no_database_is_refused_and_closed(path, monkeypatch):
     closed = []
 

@@ -261,6 +261,10 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys):
     assert "overconfident since step 211" in out
     assert "since t = 20 s" in out
     assert " 2.500 " in out  # NIS / dof over all
+    w, unix = changed(), 1.7e9
+    late = monitor_document(w.name, w.monitor, w.alarm, w.alarm_t + unix, w.since_t + unix, unix - 1.0)
+    show(*late.opening)
+    assert "since t = 21 s after the start" in capsys.readouterr().out
     none = NisLog(
         "f", np.arange(1.0, 5), np.full(4, np.nan), np.array([50.0, 2.0, 3.0, np.nan]), np.array([2.0, 2, 2, 0])
     )

@@ -85,6 +85,16 @@ def test_heavy_tails_in_a_few_steps_keep_their_name_beside_steps_below_the_band(
     assert verdict.status == "heavy-tailed"
 
 
+def test_heavy_tails_in_a_step_below_the_band_keep_their_name(rng):
+    """Errors of step 31 are a tenth as large, but in one run of 5."""
+    error = independent(rng, 60, 120, 3)
+    error[:, 30] *= np.where(np.arange(60) % 5 == 0, 1.0, 0.1)[:, None]
+    verdict = judge(Record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings(SURE))
+    assert (verdict.location.steps_above, verdict.location.steps_below) == (0, 1)
+    assert verdict.faults == ("scale in some step",)
+    assert verdict.status == "heavy-tailed"
+
+
 @pytest.mark.parametrize("ratio", [9.0, 25.0, 100.0])
 def test_one_axis_in_a_few_steps_is_not_heavy_tailed(rng, ratio):
     """Its NEES spreads as that of one degree of freedom, which is no heavy tail."""

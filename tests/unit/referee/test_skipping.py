@@ -290,6 +290,19 @@ def test_first_steps_that_are_right_carry_no_fault(rng):
     assert until(sample, inside, 1.5) is None
 
 
+def test_the_first_steps_hold_the_whole_stretch_of_a_fault(rng):
+    """12 steps at fault, in none of which the band is left: the first 8 do not carry it alone."""
+    error = independent(rng, 200, 60, 3)
+    error[:, :12] *= 3.0
+    sample = sample_of(Record("f", error, identities(error)), Settings())
+    wide = simultaneous_band(np.full_like(sample.nees, 3.0), 3, SURE)
+    assert not wide.outside.any()
+    for end, step in ((8, 8), (9, 16), (12, 16), (16, 16)):
+        found = until(sample, wide, 1e3, slice(0, end))
+        assert found is not None
+        assert found.step == step
+
+
 def test_no_start_to_skip_is_more_than_half(rng):
     """The end of a fault in 40 of 64 steps is named; leaving these out is no advice."""
     verdict = verdict_on(independent(rng, 100, 64, 3) * np.sqrt(np.r_[np.full(40, 9.0), np.ones(24)])[:, None])

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from command import consistency
 from numpy.testing import assert_allclose
+from recorded import read_recordings
 from scipy import stats
 
-import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
 
 pytest.importorskip("pyulog", reason="needs the extra 'ulog'")
 
-from flight import SIGMA, TOPICS, Flight, header, message, simulated
+from flight import TOPICS, Flight, header, message
 
 STEP = 20_000  # us between messages
 NAN = float("nan")
@@ -315,42 +315,9 @@ def test_two_topics_whose_clock_stands_still_have_no_partners(tmp_path):
         read_innovations(log.write(tmp_path / "a.ulg"))
 
 
-# --- flights of a simulation ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("states", [24, 25])
-def test_a_flight_of_a_simulation_is_judged(tmp_path, states):
-    path = tmp_path / "sitl.ulg"
-    errors = simulated(path, states)
-    record = cs.read(path)
-    assert record.axes == ("x", "y", "z", "roll", "pitch", "yaw")
-    assert_allclose(record.error[0], errors, atol=1e-5)  # numbers of four bytes
-    known = record.covariance[0, 2:]  # the first message comes before the first valid position
-    assert_allclose(known, np.broadcast_to(np.diag(SIGMA**2), known.shape), rtol=1e-4)
-    assert len(record.parts) == 6
-    assert_allclose(record.t[:2], [10.4, 10.5])
-    assert any("variances of estimator_states" in note for note in record.notes)
-
-
-def test_origins_of_estimates_and_truth_may_differ(tmp_path):
-    """A hundred-thousandth of a degree is 1.11 m to the north, and at 60 degrees 0.558 m to the east."""
-    path = tmp_path / "sitl.ulg"
-    errors = simulated(path, origin=(60.0, 10.0, 100.0), true_origin=(60.00001, 10.00001, 103.0))
-    off = cs.read(path).error[0, :, :3] - errors[:, :3]
-    assert_allclose(off, np.broadcast_to([1.114, 0.558, -3.0], off.shape), atol=2e-3)
-
-
-def test_what_a_flight_lacks_is_named(tmp_path):
-    path = tmp_path / "a.ulg"
-    flight(*draws(steps=3)).write(path)
-    missing = r"a\.ulg: holds no message 'vehicle_local_position'; .*'consistency monitor'"
-    with pytest.raises(InputError, match=missing):
-        cs.read(path)
+def test_a_flight_that_is_to_be_analysed_is_sent_to_the_monitor(tmp_path):
     with pytest.raises(InputError, match=r"a\.ulg: unknown kind of file; .*consistency monitor"):
-        cs.read(path, truth=path)
-    for option in ({"state": ["x"]}, {"topic": "/a"}):
-        with pytest.raises(InputError, match=rf"--{next(iter(option))}: does not go with .*a\.ulg"):
-            cs.read(path, **option)
+        read_recordings(flight(*draws(steps=3)).write(tmp_path / "a.ulg"))
 
 
 def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):

@@ -85,8 +85,12 @@ def simultaneous_band(
     )
     smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
     p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
-    low[judged] = 0.0 if sides == 1 else distributions.chi2.ppf(special.ndtr(-c), k) / alive[judged]
-    high[judged] = distributions.chi2.isf(special.ndtr(-c), k) / alive[judged]
+    counts, of_step = np.unique(alive[judged], return_inverse=True)
+    if sides == 2:
+        low[judged] = (distributions.chi2.ppf(special.ndtr(-c), counts * dof) / counts)[of_step]
+    else:
+        low[judged] = 0.0
+    high[judged] = (distributions.chi2.isf(special.ndtr(-c), counts * dof) / counts)[of_step]
     with np.errstate(invalid="ignore"):
         return Band(low, high, p_value, curve > high, curve < low)
 

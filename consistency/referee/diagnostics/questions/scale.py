@@ -383,5 +383,6 @@ def _skewed_tail(weighted: Weighted, dof: int, nu: float, spread: float) -> floa
 
 def pointwise_band(alive: Indices, dof: int) -> Array:
     """95 % interval of the ANEES of each single step, (steps,) -> (steps, 2); NaN without a run."""
-    intervals = {int(m): anees_interval(dof, int(m), CONFIDENCE) for m in set(alive[alive > 0])}
-    return np.array([intervals.get(int(m), NOTHING) for m in alive]).reshape(-1, 2)
+    counts, of_step = np.unique(alive, return_inverse=True)
+    intervals = [anees_interval(dof, int(m), CONFIDENCE) if m > 0 else NOTHING for m in counts]
+    return np.array(intervals).reshape(-1, 2)[of_step]

@@ -127,6 +127,8 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
     """
     runs, steps = nees.shape
+    if runs < 2 * error.shape[-1]:
+        return np.full(steps, np.nan), np.full(steps, np.nan)
     index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in block_slices(steps, runs)), strict=True)
     return np.concatenate(index), np.concatenate(inclination)
 

@@ -23,6 +23,7 @@ BLOCK = 2**22  # bytes: some thousand lines, whose fields take about 16 times as
 REFUSAL = "not a text file; known are .csv, .parquet, .npz, and .txt or .tum"
 BOM = b"\xef\xbb\xbf"
 PLAIN = b"0123456789+-.eE ,;\t\n"  # characters of numbers, and between them
+LARGE = 2**20  # bytes from which loading pyarrow, which reads numbers 8 times as fast, pays
 WIDE = re.compile(rb"\xff\xfe[^\0]\0|\xfe\xff\0[^\0]")  # the mark of UTF-16 and a character of ASCII
 
 
@@ -63,6 +64,8 @@ class Block:
             if data.count(separator.encode()) != (width - 1) * self.count or data.translate(None, others) != data:
                 return None
         data = data.replace((separator or ",").encode(), b" ")
+        if len(data) > LARGE and (of_lines := _by_arrow(data, width)) is not None:
+            return of_lines
         codes = np.frombuffer(data, np.uint8)
         ends = np.flatnonzero(codes == ord("\n"))
         inside = codes > ord(" ")
@@ -86,6 +89,23 @@ class Block:
             text = line.lstrip()
             if text and text[0] != "#":
                 yield number, line
+
+
+def _by_arrow(data: bytes, width: int) -> Array | None:
+    """The numbers of lines of ``width`` each, one space apart; None of other lines, and where pyarrow is missing."""
+    try:
+        from pyarrow import ArrowInvalid, BufferReader, csv, float64
+    except ImportError:
+        return None
+    types = dict.fromkeys(map(str, range(width)), float64())
+    read = csv.ReadOptions(use_threads=False, block_size=len(data), column_names=list(types))
+    parse = csv.ParseOptions(delimiter=" ", quote_char=False, ignore_empty_lines=False)
+    convert = csv.ConvertOptions(column_types=types, null_values=[])
+    try:
+        table = csv.read_csv(BufferReader(data), read, parse, convert)
+    except ArrowInvalid:
+        return None
+    return np.array([np.from_dlpack(column.chunk(0)) for column in table.columns]).T  # to_numpy loads pandas
 
 
 class LineParser:
@@ -172,14 +192,28 @@ def blocks(path: Path) -> Iterator[Block]:
             require_room(path, file.tell())
             head, end, tail = data.rpartition(b"\n")
             if end:
-                block = Block(path, b"".join([*rest, head, end]), first, ends=True)
-                yield block
-                first += block.count
+                whole = b"".join([*rest, head, end])
+                header = _header_end(whole) if first == 1 else 0
+                for lines in filter(None, (whole[:header], whole[header:])):
+                    block = Block(path, lines, first, ends=True)
+                    yield block
+                    first += block.count
                 rest = []
             rest.append(tail)
             data = _read(path, file)
     if last := b"".join(rest):
         yield Block(path, last, first, ends=False)
+
+
+def _header_end(lines: bytes) -> int:
+    """Where the first line of numbers alone begins, so that those below a header are read at once."""
+    begin = 0
+    while begin < len(lines):
+        end = lines.index(b"\n", begin)
+        if not lines[begin:end].translate(None, PLAIN + b"\r"):
+            break
+        begin = end + 1
+    return begin
 
 
 def line_of(path: Path, wanted: int) -> str:

@@ -122,6 +122,8 @@ def _inverse(poses: Array) -> Array:
 
 def _roots(runs: Sequence[Poses], part: list[int]) -> Iterator[Guess]:
     """Standard deviations, an inverse or a root in the place of the covariance."""
+    if any((p.variances < 0).any() for p in runs):
+        return
     beside = _cross_terms(runs, part)
     yield Guess("its diagonal holds standard deviations; square them", changed(covariance=_squared))
     if beside.any() and (np.abs(beside) <= 1.0).all():

@@ -99,12 +99,6 @@ def _trajectories(path: Path, r: Reading, poses_alone: bool) -> Found:
     return read_tum(path, r, poses_alone)
 
 
-def _simulation(path: Path, r: Reading, poses_alone: bool) -> Found:
-    from consistency.referee.readers.formats.px4_simulation import read_simulation
-
-    return read_simulation(path, r, poses_alone)
-
-
 def _program_runs(path: Path, r: Reading, poses_alone: bool) -> Found:
     from consistency.referee.readers.pipeline.program_runs import read_program_runs
 
@@ -119,10 +113,6 @@ def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 def _is_table_folder(path: Path, r: Reading) -> bool:
     return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path, r.columns))
-
-
-def _is_simulation(path: Path, r: Reading) -> bool:
-    return path.suffix.lower() == ".ulg" and r.truth is None
 
 
 def _is_archive(path: Path, r: Reading) -> bool:
@@ -142,7 +132,6 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
     Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
-    Kind(_is_simulation, (*OF_NAMES, *OF_BAGS, *OF_FILES, *OF_TRUTH, "dof"), _simulation),
     Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),

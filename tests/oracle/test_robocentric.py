@@ -23,6 +23,7 @@ from consistency.bench.filters.parts.converting import (
 from consistency.bench.filters.parts.invariant_pose import bend
 from consistency.bench.filters.parts.inverse_range import Pixels, carried, second_order
 from consistency.bench.filters.parts.parking import Parking, _is_worth_it, make_clones, unpark
+from consistency.bench.filters.parts.reactivation import _stays
 from consistency.bench.filters.parts.sensors import Growth
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook import inverse_range, robocentric_state
@@ -136,13 +137,13 @@ def test_the_kernel_has_the_second_order_of_its_twin(sensor, rng, i):
     sigmas, own, R = (0.05, 0.2), random_covariance(rng), heading_matrix(-TURN)
     second = said_of(Y, sensor)[i : i + 1]
     frame, mount = Frame(*(-R[:2, 0] * DRIVE), R[0, 0], R[1, 0]), sensor.mount.packed()
-    there, J, D, L, means, spread = np.zeros(3), *np.zeros((5, 3, 3))
-    b = carried(Y[i], frame, mount, there, J, D)
+    there, J, D, B, L, means, spread = np.zeros(3), *np.zeros((6, 3, 3))
+    b = carried(Y[i], frame, mount, there, J, D, B)
     P = np.zeros((9, 9))
     P[4:7, 4:7] = np.triu(own)
     take_root(P, 4, L)
     assert close(L, np.linalg.cholesky(own), 1e-14)
-    second_order(Y[i], L, b, D, frame, mount, *sigmas, *np.zeros((2, 5, 4)), means, spread)
+    second_order(Y[i], L, b, D, B, frame, mount, *sigmas, 0, np.zeros((5, 9)), means, spread)
     mean = 0.5 * np.square(sigmas)[:, None] * second[0, [3, 4], [3, 4]]
     assert close(means[:2], mean, 1e-14)
     assert np.abs(mean).max(axis=1).min() > 1e-5
@@ -346,7 +347,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng, on):
     poses, xi = rng.normal(size=(4, 3)), 0.3 * rng.normal(size=(4, 3))
     moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
-    update = Converting(pixels, 20, 12, clones, True, True, True, True, 0.0, 1.0, True, 0.0025, 0.0004, 0.3, 0.8)
+    update = Converting(pixels, 20, 12, clones, True, True, True, True, 0.0, 1.0, True, 0.0025, 0.0004, 0.03, 0.4, 0.8)
     room = converting_room(update, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)
@@ -489,8 +490,42 @@ def test_a_landmark_in_doubt_waits_until_the_turn_is_known(small):
                 assert in_doubt or not waits
                 if waits:
                     limit = textbook.UNTURNED if is_first else textbook.DOUBT
+                    at = state.places[label] + 2
                     assert robocentric_state.turn_variance(state, label) > limit**2
+                    assert np.sqrt(state.P[at, at]) < textbook.KNOWN * state.x[at]
     assert min(counts.values()) > 2, counts
+
+
+@pytest.mark.parametrize(
+    "turn, of_rho, is_first, waits",
+    [
+        (0.06, 0.011, True, True),
+        (0.06, 0.013, True, False),
+        (0.04, 0.011, True, False),
+        (0.04, 0.011, False, True),
+        (0.04, 0.013, False, False),
+        (0.01, 0.011, False, False),
+    ],
+)
+def test_a_landmark_waits_only_where_its_distance_is_well_known(uvd, turn, of_rho, is_first, waits):
+    """At rho = 0.4 per metre 3 % are 0.012."""
+    P = np.diag(np.square([0.1, 0.1, np.hypot(0.1, turn), 0.1, 0.1, of_rho, 0.1, 0.1, 0.1]))
+    P[2, 8] = P[8, 2] = 0.01
+    x = np.append([1.0, 2.0, 0.5, 1.0, 0.2, 0.4], np.zeros(3))
+    state = robocentric_state.CentredState(
+        x, P, problem_of(cs.simulate(uvd), uvd.belief), places={0: 3}, parked={0: 1}, clones={1: 6}
+    )
+    limit = textbook.UNTURNED if is_first else textbook.DOUBT
+    filter_ = textbook.RobotCentredKalman("trial", inverse_range.Corrections())
+    assert filter_._waits(state, 0, limit) is waits
+    local = make_clones(Parking(50, 20, 4e-4, np.inf, True, True), 3, 9, 100, 1)
+    local.of[0], local.here[0], local.doubted[0] = 0, 6, 1
+    local.step[0], local.earlier[0] = 9, 2 if is_first else 8
+    limits = textbook.UNTURNED**2, textbook.DOUBT**2, textbook.KNOWN
+    update = Converting(*[0] * 8, 0.0, 0.0, True, *limits, textbook.BLURRED, textbook.NEAR)
+    assert bool(_stays(update, 0, State(x, P, 9, 0, np.array([3])), local)) is waits
+    local.doubted[0] = 0
+    assert not _stays(update, 0, State(x, P, 9, 0, np.array([3])), local)
 
 
 def slow_steps(**changes):
@@ -559,20 +594,20 @@ def test_what_is_driven_through_is_forgotten_and_what_does_not_settle_is_left_ou
 @pytest.mark.parametrize(
     "y, sd, fresh, is_lost",
     [
-        ([1.0, 0.2, 0.9], [0.1, 0.1, 0.2], 0.0, False),
+        ([1.0, 0.2, 0.9], [0.1, 0.1, 0.3], 0.0, False),
         ([1.0, 0.2, -0.1], [0.1, 0.1, 0.2], 0.0, True),
-        ([1.0, 0.2, 0.4], [0.31, 0.1, 0.1], 0.0, True),
-        ([1.0, 0.2, 0.4], [0.31, 0.1, 0.1], 0.2, False),
-        ([1.0, 0.2, 0.4], [0.1, 0.31, 0.1], 0.2, True),
-        ([1.0, 0.2, 0.7], [0.1, 0.1, 0.3], 0.0, False),
-        ([1.0, 0.2, 0.9], [0.1, 0.1, 0.3], 0.0, True),
+        ([1.0, 0.2, 0.4], [0.41, 0.1, 0.1], 0.0, True),
+        ([1.0, 0.2, 0.4], [0.41, 0.1, 0.1], 0.2, False),
+        ([1.0, 0.2, 0.4], [0.1, 0.41, 0.1], 0.2, True),
+        ([1.0, 0.2, 0.7], [0.1, 0.1, 0.4], 0.0, False),
+        ([1.0, 0.2, 0.9], [0.1, 0.1, 0.4], 0.0, True),
     ],
 )
 def test_a_landmark_is_lost_where_a_linear_model_no_longer_holds(uvd, y, sd, fresh, is_lost):
     x, P = np.append([1.0, 2.0, 0.5], y), np.diag(np.square([0.1, 0.1, 0.1, *sd]))
     state = robocentric_state.CentredState(x, P, problem_of(cs.simulate(uvd), uvd.belief), places={0: 3})
     filter_ = textbook.RobotCentredKalman("trial", inverse_range.Corrections())
-    update = Converting(*[0] * 8, 0.0, 0.0, True, 0.0, 0.0, textbook.BLURRED, textbook.NEAR)
+    update = Converting(*[0] * 8, 0.0, 0.0, True, 0.0, 0.0, 0.0, textbook.BLURRED, textbook.NEAR)
     assert filter_._is_driven_through(state, 0, fresh) is is_lost
     assert bool(_is_driven_through(update, x, P, 3, fresh)) is is_lost
 

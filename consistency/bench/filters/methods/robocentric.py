@@ -23,6 +23,7 @@ from consistency.bench.filters.textbook.robocentric import (
     COOLING,
     COOLING_EARLY,
     DOUBT,
+    KNOWN,
     NEAR,
     PASSES,
     PASSES_CHAINED,
@@ -58,7 +59,7 @@ def compiled(textbook: RobotCentredKalman) -> Compiled:
             landmark=InverseRange(sensor.mount.packed()), error=InvariantPose(which.moments), point=Converted(),
             update=Converting(
                 pixels, passes, chain if which.turning else 0, clones, which.recency, which.curvature,
-                which.spread, which.own_spread, decades, cooling, which.waiting, unturned, held, blurred, NEAR,
+                which.spread, which.own_spread, decades, cooling, which.waiting, unturned, held, KNOWN, blurred, NEAR,
             ),
             covariance=Parking(every, unseen, doubt, adrift, which.turning, which.patience),
         )  # fmt: skip

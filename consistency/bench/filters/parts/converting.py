@@ -33,9 +33,11 @@ from consistency.bench.filters.kernel.update_steps import Work
 from consistency.bench.filters.parts.invariant_pose import exponential, left_jacobian, move_pose
 from consistency.bench.filters.parts.inverse_range import (
     Pixels,
+    add_square,
     carried,
     conversion_jacobian,
     convert,
+    row_times,
     second_order,
     subtract_bias,
 )
@@ -53,10 +55,10 @@ class Converting(NamedTuple):
     noise and, with ``own_spread``, their own errors add to second order. The noise of a new return in doubt is raised
     by so many ``decades`` at first, that of any return by as many as it is below what is predicted if these are 0, and
     by ``cooling`` less in each pass. ``leaving_out``: a return that does not settle is left out of the update. A
-    landmark in doubt stays parked where the variance of the turn since its clone, rad^2, is above ``unturned`` after
-    its first update, and above ``held`` after later ones. One in use and out of sight is forgotten where its direction,
-    rad, or its rho are known no better than ``blurred``, 0 for never: its rho in relation to itself, and only if that
-    is above ``near``.
+    landmark in doubt whose rho is known to this part of it, ``known``, stays parked where the variance of the turn
+    since its clone, rad^2, is above ``unturned`` after its first update, and above ``held`` after later ones. One in
+    use and out of sight is forgotten where its direction, rad, or its rho are known no better than ``blurred``, 0 for
+    never: its rho in relation to itself, and only if that is above ``near``.
     """
 
     pixels: Pixels
@@ -72,6 +74,7 @@ class Converting(NamedTuple):
     leaving_out: bool
     unturned: float
     held: float
+    known: float
     blurred: float
     near: float
 
@@ -108,7 +111,7 @@ class ConvertingRoom(NamedTuple):
     moving: Indices  # (n / 3,) offsets of the landmarks that move
     J: Array  # (n / 3, 3, 3) how
     own_spread: Array  # (n / 3, 3, 3) covariance that the errors of each alone add to second order, upper half
-    ways: Array  # (2, 5, 4) derivatives by these errors
+    ways: Array  # (5, 9) derivatives by these errors
     three: Array  # (4, 3, 3)
     poses: Array  # (5, 3)
 
@@ -132,7 +135,7 @@ def converting_room(update: Converting, w: int, s: int, m: int, n: int) -> Conve
         matrix(c + 1, 3), blocks(c + 1, 3, 3), blocks(c + 1, 3, 3),
         blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3), blocks(m, 3, 3),
         matrix(m, 3), matrix(m, 3), blocks(m, 3, 3), vector(most), vector(most),
-        matrix(4, n), integers(n // 3, 0), blocks(n // 3, 3, 3), blocks(n // 3, 3, 3), blocks(2, 5, 4),
+        matrix(4, n), integers(n // 3, 0), blocks(n // 3, 3, 3), blocks(n // 3, 3, 3), matrix(5, 9),
         blocks(4, 3, 3), matrix(5, 3),
     )  # fmt: skip
 
@@ -160,9 +163,9 @@ def predict_centred(
     for label in range(len(state.offset)):
         o = state.offset[label]
         if o >= 0 and local.of[label] < 0:
-            J, D, L, means, there = room.J[moving], room.three[0], room.three[1], room.three[2], room.poses[0]
-            rho = x[o + 2]
-            point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D)
+            J, own, there, rho = room.J[moving], room.own_spread[moving], room.poses[0], x[o + 2]
+            D, B, L, means = room.three[0], room.three[1], room.three[2], room.three[3]
+            point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D, B)
             along, about = u[0] * slam.motion.sigma_v, u[0] * slam.motion.sigma_omega
             for a in range(3):
                 noise[0, o + a] = -along * rho * (D[a, 0] * c + D[a, 1] * s)
@@ -170,15 +173,13 @@ def predict_centred(
             if update.curvature or update.spread:
                 take_root(P, o, L)
                 second_order(
-                    x[o : o + 3], L, point, D, turn, slam.landmark.mount, along, about, room.ways[0], room.ways[1],
-                    means, room.own_spread[moving],
+                    x[o : o + 3], L, point, D, B, turn, slam.landmark.mount, along, about,
+                    0 if update.own_spread else 3, room.ways, means, own,
                 )  # fmt: skip
                 if not update.own_spread:
-                    of_rho = along * np.sqrt(P[o + 2, o + 2])
-                    for a in range(3):
-                        for b in range(3):
-                            by_drive = (D[a, 0] * c + D[a, 1] * s) * (D[b, 0] * c + D[b, 1] * s)
-                            room.own_spread[moving, a, b] = of_rho * of_rho * by_drive
+                    d0, d1, d2 = row_times(D, 0, c, s, 0.0), row_times(D, 1, c, s, 0.0), row_times(D, 2, c, s, 0.0)
+                    fill_matrix(own, 0.0)
+                    add_square(along * along * P[o + 2, o + 2], d0, d1, d2, own)
                 for a in range(3):
                     if update.curvature:
                         there[a] += means[0, a] + means[1, a]

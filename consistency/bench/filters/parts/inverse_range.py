@@ -80,10 +80,11 @@ def by_ray(q: Triple, rho: float, there: Array, D: Array) -> float:
 
 
 @inner
-def carried(y: Array, turn: Frame, mount: Mounting, there: Array, J: Array, D: Array) -> Triple:
+def carried(y: Array, turn: Frame, mount: Mounting, there: Array, J: Array, D: Array, B: Array) -> Triple:
     """``there`` (3,) <- y (3,) after a change b -> R b + t of the robot's frame; ``J`` <- its derivative by y.
 
-    ``D`` (3, 3) <- its derivative by rho times the point in the new frame of the robot, which is returned.
+    ``D`` (3, 3) <- its derivative by rho times the point in the new frame of the robot, b, which is returned; ``B``
+    (3, 3) <- the derivative by y of b less rho times the place of the sensor.
     """
     c, s, rho = turn.c, turn.s, y[2]
     m = rays(y[0], y[1])
@@ -92,39 +93,24 @@ def carried(y: Array, turn: Frame, mount: Mounting, there: Array, J: Array, D: A
     px, py = c * bx - s * by + rho * turn.x, s * bx + c * by + rho * turn.y
     q = inward(mount, px - rho * mount.x, py - rho * mount.y, bz - rho * mount.z)
     per_range = by_ray(q, rho, there, D)
-    ax, ay, az = outward(mount, m[3], m[4], m[5])
-    a = inward(mount, c * ax - s * ay, s * ax + c * ay, az)
-    ex, ey, ez = outward(mount, m[6], m[7], m[8])
-    e = inward(mount, c * ex - s * ey, s * ex + c * ey, ez)
-    ox, oy = c * mount.x - s * mount.y + turn.x - mount.x, s * mount.x + c * mount.y + turn.y - mount.y
-    o = inward(mount, ox, oy, 0.0)
+    for j in range(2):
+        x, v, B[2, j] = outward(mount, m[3 + 3 * j], m[4 + 3 * j], m[5 + 3 * j])
+        B[0, j], B[1, j] = c * x - s * v, s * x + c * v
+    B[0, 2] = c * mount.x - s * mount.y + turn.x - mount.x
+    B[1, 2] = s * mount.x + c * mount.y + turn.y - mount.y
+    B[2, 2] = 0.0
     for i in range(3):
-        d0, d1, d2 = D[i, 0], D[i, 1], D[i, 2]
-        J[i, 0] = d0 * a[0] + d1 * a[1] + d2 * a[2]
-        J[i, 1] = d0 * e[0] + d1 * e[1] + d2 * e[2]
-        J[i, 2] = d0 * o[0] + d1 * o[1] + d2 * o[2]
-        D[i, 0], D[i, 1], D[i, 2] = outward(mount, d0, d1, d2)
+        D[i, 0], D[i, 1], D[i, 2] = outward(mount, D[i, 0], D[i, 1], D[i, 2])
+        for j in range(3):
+            J[i, j] = row_times(D, i, B[0, j], B[1, j], B[2, j])
     J[2, 2] += per_range
     return px, py, bz
 
 
 @inner
-def bent(q: Triple, rho: float, u: Array, w: Array) -> Triple:
-    """Second derivative of azimuth, elevation and rho / |q| along u (4,) and w (4,), derivatives of q and of rho."""
-    h2 = q[0] * q[0] + q[1] * q[1]
-    r2 = h2 + q[2] * q[2]
-    h, r = np.sqrt(h2), np.sqrt(r2)
-    flat_u, flat_w = q[0] * u[0] + q[1] * u[1], q[0] * w[0] + q[1] * w[1]
-    across_u, across_w = q[0] * u[1] - q[1] * u[0], q[0] * w[1] - q[1] * w[0]
-    whole_u, whole_w = flat_u + q[2] * u[2], flat_w + q[2] * w[2]
-    up_u, up_w = h * u[2] - q[2] * flat_u / h, h * w[2] - q[2] * flat_w / h
-    level = u[0] * w[0] + u[1] * w[1]
-    by_range = rho * (3.0 * whole_u * whole_w / r2 - level - u[2] * w[2]) - u[3] * whole_w - w[3] * whole_u
-    return (
-        -(across_u * flat_w + across_w * flat_u) / (h2 * h2),
-        -(up_u * whole_w + up_w * whole_u) / (r2 * r2) - q[2] * (level - flat_u * flat_w / h2) / (h * r2),
-        by_range / (r * r2),
-    )
+def row_times(A: Array, i: int, x: float, y: float, z: float) -> float:
+    """Row i of A (3, 3) times (x, y, z)."""
+    return float(A[i, 0] * x + A[i, 1] * y + A[i, 2] * z)
 
 
 @inner
@@ -133,12 +119,13 @@ def second_order(
     L: Array,
     b: Triple,
     D: Array,
+    B: Array,
     turn: Frame,
     mount: Mounting,
-    along: float,
-    about: float,
+    of_drive: float,
+    of_turn: float,
+    first: int,
     ways: Array,
-    rays_by: Array,
     means: Array,
     own: Array,
 ) -> None:
@@ -149,59 +136,77 @@ def second_order(
     deviation each, and half of that for the square of one. An error s of the turn takes b to Rz(-s) b, one of the drive
     to b - s rho (c, s, 0).
 
+    With the first derivatives a, e, l and t of azimuth, elevation, logarithm of the range and rho, those of second
+    order along two straight ways u and w are -(a_u k_w + a_w k_u) with k = l - e tan, -(e_u l_w + e_w l_u) -
+    a_u a_w sin cos and -(t_u l_w + t_w l_u) - rho (e_u e_w + a_u a_w cos^2), of the elevation. A way that bends adds D
+    times its own second derivative. rho here is that of the new frame.
+
     Parameters
     ----------
     L : (3, 3), lower root of the covariance of y
-    b, D : as of :func:`carried`
-    along, about : standard deviations of drive (m) and turn (rad)
-    ways, rays_by : (5, 4), work arrays: derivatives of b, and of the ray, with that of rho behind both
-    """  # fmt: skip
-    m, rho, c, s = rays(y[0], y[1]), y[2], turn.c, turn.s
-    for k in range(5):
-        way, r = ways[k], L[2, k] if k < 3 else 0.0
-        if k < 3:
-            x, v, z = outward(mount, L[0, k] * m[3] + L[1, k] * m[6], L[0, k] * m[4] + L[1, k] * m[7], L[1, k] * m[8])
-            x, v = x + r * mount.x, v + r * mount.y
-            way[0], way[1], way[2] = c * x - s * v + r * turn.x, s * x + c * v + r * turn.y, z + r * mount.z
-        elif k == 3:
-            way[0], way[1], way[2] = -along * rho * c, -along * rho * s, 0.0
+    b, D, B : as of :func:`carried`
+    of_drive, of_turn : standard deviations of drive (m) and turn (rad)
+    first : 0, or 3 for the two noises alone
+    ways : (5, 9), work array: by each error, the derivatives of b - rho s (3), with s the place of the sensor, and of
+        rho; then a, e, t, l and k
+    """
+    rho, sine, cosine = y[2], np.sin(y[1]), np.cos(y[1])
+    x, v, z = b[0] - rho * mount.x, b[1] - rho * mount.y, b[2] - rho * mount.z
+    per_range2 = 1.0 / (x * x + v * v + z * z)
+    per_range = np.sqrt(per_range2)
+    up = per_range * (mount.xz * x + mount.yz * v + mount.zz * z)
+    flat2 = 1.0 - up * up
+    flat, n0, n1, n2 = np.sqrt(flat2), x - rho * B[0, 2], v - rho * B[1, 2], z
+    for k in range(first, 5):
+        way = ways[k]
+        way[2] = way[3] = 0.0
+        if k == 3:
+            way[0], way[1] = -of_drive * rho * turn.c, -of_drive * rho * turn.s
+        elif k == 4:
+            way[0], way[1] = of_turn * b[1], -of_turn * b[0]
         else:
-            way[0], way[1], way[2] = about * b[1], -about * b[0], 0.0
-        x, v, z = inward(mount, way[0] - r * mount.x, way[1] - r * mount.y, way[2] - r * mount.z)
-        rays_by[k, 0], rays_by[k, 1], rays_by[k, 2], way[3], rays_by[k, 3] = x, v, z, r, r
-    q = inward(mount, b[0] - rho * mount.x, b[1] - rho * mount.y, b[2] - rho * mount.z)
-    fill_matrix(own, 0.0)
-    for k in range(5):
-        for i in range(k, 5):
-            z = 0.0
-            if i == 4:
-                x, v = about * ways[k, 1], -about * ways[k, 0]
-            elif i == 3:
-                x, v = -along * c * ways[k, 3], -along * s * ways[k, 3]
-            else:
-                flat, up = L[0, k] * L[0, i], L[1, k] * L[1, i]
-                mixed = L[0, k] * L[1, i] + L[1, k] * L[0, i]
-                x, v, z = outward(
-                    mount, -(flat + up) * m[0] - mixed * m[7], -(flat + up) * m[1] + mixed * m[6], -up * m[2]
-                )
-                x, v = c * x - s * v, s * x + c * v
-            p = _bent_and_moved(bent(q, rho, rays_by[k], rays_by[i]), D, x, v, z)
+            way[3] = L[2, k]
             for a in range(3):
-                if k == i and k > 2:
-                    means[k - 3, a] = 0.5 * p[a]
-                    continue
-                for j in range(a, 3):
-                    own[a, j] += (0.5 if k == i else 1.0) * p[a] * p[j]
+                way[a] = row_times(B, a, L[0, k], L[1, k], L[2, k])
+        for a in range(3):
+            way[4 + a] = row_times(D, a, way[0], way[1], way[2])
+        way[6] += way[3] * per_range
+        way[7] = per_range2 * (x * way[0] + v * way[1] + z * way[2])
+        way[8] = way[7] - way[5] * up / flat
+    fill_matrix(own, 0.0)
+    for k in range(first, 5):
+        u = ways[k]
+        for i in range(k, 5):
+            w = ways[i]
+            if i == 4:
+                x, v, z = of_turn * (u[1] + u[3] * mount.y), -of_turn * (u[0] + u[3] * mount.x), 0.0
+            elif i == 3:
+                x, v, z = -of_drive * turn.c * u[3], -of_drive * turn.s * u[3], 0.0
+            else:
+                aa, ae, ee = L[0, k] * L[0, i], L[0, k] * L[1, i] + L[1, k] * L[0, i], L[1, k] * L[1, i]
+                by_n, by_a, by_e = -cosine * cosine * aa - ee, -ae * sine / cosine, sine * cosine * aa
+                x = by_n * n0 + by_a * B[0, 0] + by_e * B[0, 1]
+                v = by_n * n1 + by_a * B[1, 0] + by_e * B[1, 1]
+                z = by_n * n2 + by_a * B[2, 0] + by_e * B[2, 1]
+            a = row_times(D, 0, x, v, z) - u[4] * w[8] - w[4] * u[8]
+            e = row_times(D, 1, x, v, z) - u[5] * w[7] - w[5] * u[7] - up * flat * u[4] * w[4]
+            t = row_times(D, 2, x, v, z) - u[6] * w[7] - w[6] * u[7]
+            t -= rho * per_range * (u[5] * w[5] + flat2 * u[4] * w[4])
+            if k == i and k > 2:
+                means[k - 3, 0], means[k - 3, 1], means[k - 3, 2] = 0.5 * a, 0.5 * e, 0.5 * t
+            else:
+                add_square(0.5 if k == i else 1.0, a, e, t, own)
 
 
 @inner
-def _bent_and_moved(g: Triple, D: Array, x: float, y: float, z: float) -> Triple:
-    """g + D (x, y, z)."""
-    return (
-        g[0] + D[0, 0] * x + D[0, 1] * y + D[0, 2] * z,
-        g[1] + D[1, 0] * x + D[1, 1] * y + D[1, 2] * z,
-        g[2] + D[2, 0] * x + D[2, 1] * y + D[2, 2] * z,
-    )
+def add_square(weight: float, x: float, y: float, z: float, A: Array) -> None:
+    """Upper half of A (3, 3) <- A + weight (x, y, z) (x, y, z)'."""
+    A[0, 0] += weight * x * x
+    A[0, 1] += weight * x * y
+    A[0, 2] += weight * x * z
+    A[1, 1] += weight * y * y
+    A[1, 2] += weight * y * z
+    A[2, 2] += weight * z * z
 
 
 @implement(world_point, InverseRange)

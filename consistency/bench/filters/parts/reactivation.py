@@ -65,9 +65,10 @@ def correct_converted(
 
 @inner
 def _stays(update: Converting, label: int, state: State, local: Clones) -> bool:
-    """Whether the turn since the clone of a landmark in doubt is little known, also after the update."""
-    most = update.unturned if is_new(label, local) else update.held
-    return is_in_doubt(label, local) and turn_variance(label, state, local) > most
+    """Whether a landmark in doubt, well known in distance, has a turn since its clone that is not, after the update."""
+    rho, most = state.offset[label] + 2, update.unturned if is_new(label, local) else update.held
+    is_known = state.P[rho, rho] < (update.known * state.x[rho]) ** 2
+    return is_known and is_in_doubt(label, local) and turn_variance(label, state, local) > most
 
 
 @implement(predict_innovation, Converting)
@@ -273,14 +274,16 @@ def _iterate(
 
 
 @inner
-def _seen_from(slam: Slam, clone: Array, pose: Array, y: Array, there: Array, J: Array, shift: Array, D: Array) -> None:
+def _seen_from(
+    slam: Slam, clone: Array, pose: Array, y: Array, there: Array, J: Array, shift: Array, D: Array, B: Array
+) -> None:
     """``there`` <- a landmark parked at ``clone`` as it is seen from ``pose``; its derivatives by y and by xi."""
     at, frame = robot_frame(clone), robot_frame(pose)
     c, s = frame.c, frame.s
     dx, dy = at.x - frame.x, at.y - frame.y
     turn = Frame(c * dx + s * dy, c * dy - s * dx, c * at.c + s * at.s, c * at.s - s * at.c)
     rho = y[2]
-    b = carried(y, turn, slam.landmark.mount, there, J, D)
+    b = carried(y, turn, slam.landmark.mount, there, J, D, B)
     wx, wy = c * b[0] - s * b[1] + rho * frame.x, s * b[0] + c * b[1] + rho * frame.y
     for a in range(3):
         shift[a, 0] = rho * (D[a, 0] * c - D[a, 1] * s)
@@ -302,14 +305,14 @@ def _expect(
 ) -> None:
     """h and its Jacobians where ``delta`` leads, and the observations there; those of landmarks in use once."""
     x, room, delta = state.x, work.room, work.room.delta
-    D, around = room.three[0], room.poses[0]
+    D, B, around = room.three[0], room.three[1], room.poses[0]
     for j in range(m):
         o, h, c = work.at[j], room.h[j], room.clone[j]
         for a in range(3):
             h[a] = x[o + a] + delta[3 + 3 * j + a]
         if c >= 0:
             copy(h, around)
-            _seen_from(slam, room.frames[c], room.frames[clones], around, h, room.own[j], room.shift[j], D)
+            _seen_from(slam, room.frames[c], room.frames[clones], around, h, room.own[j], room.shift[j], D, B)
             _times(1.0, room.shift[j], room.turns[c], room.by_clone[j])
             _times(-1.0, room.shift[j], room.turns[clones], room.by_pose[j])
         if is_first or c >= 0:
@@ -431,7 +434,7 @@ def _reactivate(slam: Slam, state: State, label: int, local: Clones, work: Work[
     number, o = local.of[label], state.offset[label]
     q = local.here[number]
     move_pose(local.origin[number], x[q : q + 3], clone)
-    _seen_from(slam, clone, x[:3], x[o : o + 3], there, J, shift, D)
+    _seen_from(slam, clone, x[:3], x[o : o + 3], there, J, shift, D, turned)
     copy(there, x[o : o + 3])
     left_jacobian(x[q : q + 3], D)
     _times(1.0, shift, D, turned)

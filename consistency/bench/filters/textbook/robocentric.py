@@ -18,6 +18,8 @@ after the update: the robot may then be anywhere on a circle about it, a straigh
 frame of the robot would keep p + R m / rho to first order only, with an error of half its distance times the square of
 the turn's. From the second such step on the robot hangs on that clone, since a turn about a point is Exp of one xi, and
 of a sum of many to first order only; and the landmark waits until the turn is known better than at its first sight.
+Only one whose distance is well known waits: that of another changes from update to update, and with it the point about
+which the robot may turn, so that linear updates would learn of a turn that nothing has shown.
 
 Where a return is hardly predicted, Gauss-Newton overshoots: its noise begins at what is not known of it and falls by
 ten in a pass (*tempering*). A return that does not settle is left out of the update, and tried again when it is seen
@@ -95,7 +97,8 @@ DOUBT = (
 )
 ADRIFT = 0.2  # rad, standard deviation of the heading from which any return is in doubt
 UNTURNED = 0.05  # rad, that of the turn after its first update, above which a landmark in doubt stays parked
-BLURRED = 0.3  # rad, and of rho: standard deviation above which a landmark out of sight is forgotten
+KNOWN = 0.03  # relative standard deviation of its distance from the clone up to which it may
+BLURRED = 0.4  # rad, and of rho: standard deviation above which a landmark out of sight is forgotten
 NEAR = 0.8  # 1/m, rho from which that of rho is asked for
 PASSES, SETTLED = 20, 1e-3  # of an update at most, and the change in standard deviations that ends it
 PASSES_CHAINED = 16  # and in a chain: one that has not settled by then is given up, and each pose moved by itself
@@ -243,12 +246,11 @@ class RobotCentredKalman:
             (after, _), turned = charted(state, found.delta, chart), found.C
         turned = np.linalg.inv(shifts_of(after)) @ turned
         after = replace(after, P=turned @ (P - found.W @ found.S @ found.W.T) @ turned.T)
-        waits = in_doubt if self.which.waiting else np.zeros(len(seen), bool)
-        limits = np.where(new, UNTURNED, DOUBT)
+        limits = np.where(in_doubt & self.which.waiting, np.where(new, UNTURNED, DOUBT), np.inf)
         back = [
             label
-            for label, may_wait, limit in zip(seen, waits, limits, strict=True)
-            if label in state.parked and not (may_wait and turn_variance(after, label) > limit**2)
+            for label, limit in zip(seen, limits, strict=True)
+            if label in state.parked and not self._waits(after, label, limit)
         ]
         return activated(after, back), Info(found.innovation, found.S, found.W), seen
 
@@ -291,6 +293,12 @@ class RobotCentredKalman:
         fresh = state.noise[2] @ state.noise[2]
         is_adrift = self.which.adrift and state.P[2, 2] - fresh > ADRIFT**2
         return bool(is_adrift or turn_variance(state, label) - fresh > DOUBT**2)
+
+    def _waits(self, state: CentredState, label: int, limit: float) -> bool:
+        """Whether the turn since the clone of a landmark is little known after its update, but its distance well."""
+        rho = state.places[label] + 2
+        is_known = state.P[rho, rho] < (KNOWN * state.x[rho]) ** 2
+        return bool(is_known and turn_variance(state, label) > limit**2)
 
     def _is_driven_through(self, state: CentredState, label: int, fresh: float) -> bool:
         """Whether a linear model no longer holds where a landmark is, as after driving through it.

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from consistency.referee.diagnostics.comparison import Comparison, Difference
+from typing import TYPE_CHECKING
+
 from consistency.referee.document.blocks import Column, Table, table
+
+if TYPE_CHECKING:
+    from consistency.referee.diagnostics.comparison import Comparison, Difference
 
 LENGTHS, ANGLES = ("x", "y", "z"), ("heading", "roll", "pitch", "yaw")  # components of poses
 

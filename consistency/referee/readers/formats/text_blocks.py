@@ -105,7 +105,8 @@ def _by_arrow(data: bytes, width: int) -> Array | None:
         table = csv.read_csv(BufferReader(data), read, parse, convert)
     except ArrowInvalid:
         return None
-    return np.array([np.from_dlpack(column.chunk(0)) for column in table.columns]).T  # to_numpy loads pandas
+    values: Array = np.array([np.from_dlpack(column.chunk(0)) for column in table.columns]).T  # to_numpy loads pandas
+    return values
 
 
 class LineParser:

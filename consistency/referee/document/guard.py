@@ -6,7 +6,7 @@ from consistency.referee.diagnostics.verdict.parts import Interval, RejectionSco
 from consistency.referee.document.blocks import Cell, Column, Quantity
 from consistency.referee.document.wording import NONE
 
-COLUMNS = (
+REJECTION_COLUMNS = (
     Column("Observations", number=True),
     Column("Spurious", number=True),
     Column("Rejected", number=True),

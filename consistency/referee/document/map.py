@@ -10,7 +10,7 @@ from consistency.referee.diagnostics.words.numbers import short, with_subject
 from consistency.referee.document.blocks import Cell, Column, Quantity
 from consistency.referee.document.wording import NONE, PLAIN, written
 
-COLUMNS = (
+MAP_COLUMNS = (
     Column("Verdict on the map", "Verdict on\nthe map", width="1.2fr"),
     Column("Mean NEES / 3 of landmarks", "Mean NEES / 3\nof landmarks", number=True),
     Column("Pose and map together, NEES / dof", "Pose and map\ntogether", number=True),

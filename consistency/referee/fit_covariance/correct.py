@@ -21,7 +21,7 @@ from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
 from consistency.referee.fit_covariance.factors import (
-    Block,
+    FactorBlock,
     Factors,
     Fit,
     blocks_of,
@@ -69,7 +69,7 @@ class Correction:
     """Factors and floors for a stated covariance, with the verdict on errors that chose nothing."""
 
     name: str
-    blocks: tuple[Block, ...]
+    blocks: tuple[FactorBlock, ...]
     fits: Mapping[str, Fit] = field(repr=False)  # by group; the last one, "", is of all steps
     held_out: str  # "in turn", "half" or names
     runs: tuple[str, ...]  # names of all runs
@@ -138,9 +138,9 @@ class Correction:
         return plotted(partial(draw_correction, self), path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.correction_text import sentence  # of this class
+        from consistency.referee.fit_covariance.correction_text import correction_sentence  # of this class
 
-        return f"<Correction {self.name}: {sentence(self)}>"
+        return f"<Correction {self.name}: {correction_sentence(self)}>"
 
 
 def correct(
@@ -262,7 +262,7 @@ def fitted_and_judged(labels: Sequence[str], counted: Array, held_out: str | Non
     return fitted, judged
 
 
-def fit_groups(record: Record, blocks: tuple[Block, ...]) -> dict[str, Fit]:
+def fit_groups(record: Record, blocks: tuple[FactorBlock, ...]) -> dict[str, Fit]:
     """Fits to the steps of each group, by its name, and last, by the name "", that of all steps.
 
     A group that fewer than two runs pass through has the fit of all steps.
@@ -317,7 +317,7 @@ def with_factors(record: Record, used: Sequence[ByGroup]) -> Record:
     return with_covariance(record, error, P)
 
 
-def excess_of(record: Record, blocks: Sequence[Block], dof: Array) -> float:
+def excess_of(record: Record, blocks: Sequence[FactorBlock], dof: Array) -> float:
     """What the uncertainty of factors known with dof (groups, B) adds to a ratio, on average over runs."""
     _, _, nees = stated_errors(record)
     sizes = np.array([len(block) for block in blocks])
@@ -333,7 +333,7 @@ def with_covariance(record: Record, error: Array, P: Array) -> Record:
     return replace(record, error=error, covariance=P, nees=nees)
 
 
-def with_uncertainty(record: Record, blocks: Sequence[Block], dof: Array) -> Record:
+def with_uncertainty(record: Record, blocks: Sequence[FactorBlock], dof: Array) -> Record:
     """Corrected errors, less what the uncertainty of their factors adds.
 
     By a factor that is known with nu degrees of freedom the NEES of a block of n components is n times F(n, nu), not

@@ -11,7 +11,7 @@ import numpy as np
 from consistency.referee.diagnostics.records.groups_by_column import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.fit_covariance.correct import ByGroup, Correction, by_group, with_factors
-from consistency.referee.fit_covariance.correction_text import data, sentence
+from consistency.referee.fit_covariance.correction_text import correction_sentence, data_of_correction
 from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.fit_folder import toml, write_fit
 from consistency.referee.fit_covariance.page import correction_page
@@ -32,7 +32,7 @@ def write_correction(
     """
     write = partial(_write_runs, found, record, files)
     head = f"{found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component."
-    texts = {"correction.toml": toml(head, data(found)), "corrected_covariance.py": pasted(found)}
+    texts = {"correction.toml": toml(head, data_of_correction(found)), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
@@ -126,7 +126,7 @@ def pasted(found: Correction) -> str:
     table = "".join(f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items())
     turn = "heading" if "heading" in found.axes else "yaw"
     order = ("x", "y", turn) if turn == "heading" else ("roll", "pitch", "yaw", "x", "y", "z")  # of Pose2, or Pose3
-    return f'''"""Corrected covariances. {sentence(found)}."""
+    return f'''"""Corrected covariances. {correction_sentence(found)}."""
 
 import bisect
 

@@ -19,7 +19,7 @@ from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, shown
 UNITS = {"position": " m", "attitude": " rad", "velocity": " m/s"}
 
 
-def sentence(found: Correction) -> str:
+def correction_sentence(found: Correction) -> str:
     """The end that was reached, the ratios, and how they were found."""
     before, after = found.before.ratio, found.after.ratio
     how = f"{plural(len(found.judged), found.unit)}, each judged by the factors of the others"
@@ -40,9 +40,11 @@ def sentence(found: Correction) -> str:
 
 def correction_document(found: Correction) -> Document:
     """Sentence, factors, held-out figures, and limits; numbers as data."""
-    opening: list[Block] = [Text(f"{found.name}: {sentence(found)}"), _factors(found), _figures(found)]
+    opening: list[Block] = [Text(f"{found.name}: {correction_sentence(found)}"), _factors(found), _figures(found)]
     opening += map(Text, correction_lines(found))
-    return Document(f"{found.name}: correction of the stated covariance", "", (), tuple(opening), data(found))
+    return Document(
+        f"{found.name}: correction of the stated covariance", "", (), tuple(opening), data_of_correction(found)
+    )
 
 
 def _factors(found: Correction) -> Table:
@@ -101,14 +103,14 @@ def correction_lines(found: Correction) -> Iterator[str]:
     yield "the factors hold for data like these; those of new conditions may be others"
 
 
-def data(found: Correction) -> dict[str, Any]:
+def data_of_correction(found: Correction) -> dict[str, Any]:
     """Everything as plain data, as correction.toml and --json have it."""
     groups = found.before.record.groups
     return dict(
         plain({
             "name": found.name,
             "status": found.status,
-            "sentence": sentence(found),
+            "sentence": correction_sentence(found),
             "held_out": found.held_out,
             "fitted_runs": found.fitted,
             "judged_runs": found.judged,

@@ -45,7 +45,7 @@ SAME = "the stated covariance hardly varies, or has the shape of a floor, so tha
 
 
 @dataclass(frozen=True)
-class Block:
+class FactorBlock:
     """Components of the error that share a factor and a floor."""
 
     name: str
@@ -64,7 +64,7 @@ class Block:
 class Factors:
     """What a stated covariance becomes: P' = D P D + F."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[FactorBlock, ...]
     factor: Array  # (B,), on variances
     floor: Array  # (B,), variances
 
@@ -98,7 +98,7 @@ class Fit:
     notes: tuple[str, ...] = ()
 
 
-def members(blocks: Sequence[Block]) -> Array:
+def members(blocks: Sequence[FactorBlock]) -> Array:
     """Which components each block has, (B, n), 1 or 0."""
     found = np.zeros((len(blocks), sum(map(len, blocks))))
     for b, block in enumerate(blocks):
@@ -106,7 +106,7 @@ def members(blocks: Sequence[Block]) -> Array:
     return found
 
 
-def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
+def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[FactorBlock, ...]:
     """Blocks of an error of n components by their names: position, attitude, velocity, biases.
 
     Components of other names are a block each, since their units are not known; those without names are one block.
@@ -121,7 +121,7 @@ def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[Block, ...]:
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         found.setdefault(name, []).append(i)
-    return tuple(Block(name, tuple(places)) for name, places in found.items())
+    return tuple(FactorBlock(name, tuple(places)) for name, places in found.items())
 
 
 def stated_errors(record: Record) -> tuple[Array, Array, Array]:
@@ -147,7 +147,7 @@ def run_weights(record: Record) -> Array:
     return np.asarray(counts / counts.mean())
 
 
-def fit_runs(record: Record, blocks: tuple[Block, ...], fits: int = 1) -> Fit:
+def fit_runs(record: Record, blocks: tuple[FactorBlock, ...], fits: int = 1) -> Fit:
     """Fit a factor to each block of two runs or more, and a floor where the held-out log score of runs asks for it.
 
     Each run has a step that counts. Where factor and floor can be told apart, the intervals are those of the model with
@@ -192,7 +192,7 @@ def held_out_scores(record: Record, fit: Fit) -> Array:
 # --- factors alone ----------------------------------------------------------------------------------------------------
 
 
-def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
+def fit_alone(record: Record, blocks: tuple[FactorBlock, ...]) -> Fit:
     """Fit a factor to each block of the errors of two runs or more, without floors."""
     sizes = np.array([len(block) for block in blocks], float)
     w = run_weights(record)
@@ -212,7 +212,7 @@ def fit_alone(record: Record, blocks: tuple[Block, ...]) -> Fit:
     )
 
 
-def run_moments(record: Record, blocks: Sequence[Block]) -> Array:
+def run_moments(record: Record, blocks: Sequence[FactorBlock]) -> Array:
     """Q (R, B, B): means over the steps of each run of e_b' (P^-1)_bc e_c, which is all that factors are fitted to."""
     Q = []
     for error, P in steps_of_runs(record):
@@ -260,7 +260,7 @@ def known_dof(left_out: Array, sizes: Array, runs: float) -> Array:
 # --- factors and floors -----------------------------------------------------------------------------------------------
 
 
-def likeness(record: Record, block: Block) -> float:
+def likeness(record: Record, block: FactorBlock) -> float:
     """Squared cosine between the stated covariance of a block and a floor, in the metric of the likelihood.
 
     1 where each covariance is the same multiple of the identity.
@@ -321,14 +321,14 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     )
 
 
-def with_parameters(blocks: tuple[Block, ...], free: Indices, theta: Array) -> Factors:
+def with_parameters(blocks: tuple[FactorBlock, ...], free: Indices, theta: Array) -> Factors:
     """A factor of each block, and the floors of those that are free, from parameters (p,) in this order."""
     floor = np.zeros(len(blocks))
     floor[free] = theta[len(blocks) :]
     return Factors(blocks, theta[: len(blocks)], floor)
 
 
-def scores(record: Record, blocks: tuple[Block, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
+def scores(record: Record, blocks: tuple[FactorBlock, ...], free: Indices, theta: Array) -> tuple[Array, Array, Array]:
     """The score of a step, mean of each run times its weight: shapes (R,), (R, p) and (R, p, p)."""
     factors = with_parameters(blocks, free, theta)
     found = []

@@ -24,7 +24,7 @@ MARK = {"consistent": "", "undecided": " ?", "overconfident": " overconfident", 
 WRONG = ("overconfident", "conservative")
 
 
-def sentence(model: NoiseModel) -> str:
+def model_sentence(model: NoiseModel) -> str:
     """Span, status, ratio with its interval, and on how many drives it rests."""
     word = model.status
     if word == "consistent":
@@ -102,12 +102,14 @@ def _unit(axis: str) -> str:
 
 def noise_document(model: NoiseModel) -> Document:
     """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
-    opening: list[Block] = [Text(f"{model.name}: {sentence(model)}")]
+    opening: list[Block] = [Text(f"{model.name}: {model_sentence(model)}")]
     if corrected := correction(model):
         opening.append(Text(corrected))
     opening.append(_table(model))
     opening += map(Text, noise_lines(model))
-    return Document(f"{model.name}: noise of motions over {_text(model.span)}", "", (), tuple(opening), data(model))
+    return Document(
+        f"{model.name}: noise of motions over {_text(model.span)}", "", (), tuple(opening), data_of_model(model)
+    )
 
 
 def correction(model: NoiseModel) -> str:
@@ -216,13 +218,13 @@ def _of_second(model: NoiseModel) -> str:
     return found
 
 
-def data(model: NoiseModel) -> dict[str, Any]:
+def data_of_model(model: NoiseModel) -> dict[str, Any]:
     """Everything as plain data, as noise.toml and --json have it."""
     noise, mean, fit, second = model.noise, model.noise.mean, model.noise.mean_fit, model.second
     found: dict[str, Any] = plain({
         "name": model.name,
         "status": model.status,
-        "sentence": sentence(model),
+        "sentence": model_sentence(model),
         "span": model.span,
         "axes": noise.axes,
         "fitted_drives": model.fitted_drives,

@@ -142,9 +142,9 @@ class NoiseModel:
         return plotted(partial(draw_noise, self), path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.model_text import sentence  # of this class
+        from consistency.referee.fit_covariance.model_text import model_sentence  # of this class
 
-        return f"<NoiseModel {self.name}: {sentence(self)}>"
+        return f"<NoiseModel {self.name}: {model_sentence(self)}>"
 
 
 def decided(status: str, doubted: bool, depends: bool) -> str:

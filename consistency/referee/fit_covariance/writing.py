@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.fit_covariance.fit_folder import toml, write_fit
-from consistency.referee.fit_covariance.model_text import correction, data
+from consistency.referee.fit_covariance.model_text import correction, data_of_model
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.motions import write_motions
 from consistency.referee.fit_covariance.noise_model import NoiseModel
@@ -140,7 +140,7 @@ def _numbers(values: Array) -> str:
 def snippets(model: NoiseModel) -> dict[str, str]:
     """Files of the model for other programs, by name."""
     return {
-        "noise.toml": toml(HEAD, data(model)),
+        "noise.toml": toml(HEAD, data_of_model(model)),
         "robot_localization_noise.py": robot_localization(model),
         "gtsam_noise.py": gtsam(model),
         "ceres_noise.h": ceres(model),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 HEIGHT = 3.6  # inches
 LONG = 2000  # test ratios drawn of a sensor
 POINTS = 600  # at most, of the NIS: few enough to see a change among them
-EACH = replace(style(0), size=1.8, alpha=0.7)
+EACH_STEP = replace(style(0), size=1.8, alpha=0.7)
 FAULT = replace(style(1), dash=(), width=1.1)
 
 
@@ -41,7 +41,7 @@ def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
 
 def _draw_ratios(axes: Axes, each: GateRatios) -> None:
     """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
-    points(axes, each.t, each.ratio, EACH, limit=LONG)
+    points(axes, each.t, each.ratio, EACH_STEP, limit=LONG)
     for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)):
         if np.isfinite(at):
             axes.axhline(at, **stroke(look))
@@ -51,7 +51,7 @@ def _draw_ratios(axes: Axes, each: GateRatios) -> None:
 def _draw_sizes(axes: Axes, watched: Watched) -> None:
     """NIS over its degrees of freedom."""
     step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
-    points(axes, step, ratio, EACH, limit=POINTS)
+    points(axes, step, ratio, EACH_STEP, limit=POINTS)
     axes.axhline(1.0, **stroke(EXPECTED))
     axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
     if (ratio > 0).any():

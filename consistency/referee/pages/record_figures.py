@@ -52,7 +52,7 @@ BOUND = replace(SHOWN, dash=(4.0, 3.0), width=0.8)
 INSIDE = "#e3eef6"  # ground within 2 sigma
 LEAST_REACH = 3.0  # sigma, from 0 to the ends of an axis
 JOINT = Look("#333333", width=1.4)
-EACH = replace(style(0), size=2.0, alpha=0.7)
+EACH_RUN = replace(style(0), size=2.0, alpha=0.7)
 WORST = replace(solid(style(1)), size=3.5)
 
 Paint = Callable[["Axes"], None]
@@ -195,7 +195,7 @@ def _errors_of_runs(record: Record, of: Errors) -> Paint:
         runs, bound = record.run_numbers.astype(float), of.bound[:, 0]
         band(axes, runs, np.column_stack([-bound, bound]), "2-sigma bounds")
         axes.axhline(0.0, **stroke(ZERO))
-        points(axes, runs, of.error[:, 0], EACH, "error of a run")
+        points(axes, runs, of.error[:, 0], EACH_RUN, "error of a run")
         axes.set_ylabel(of.label)
         _span_runs(axes, record)
 
@@ -334,7 +334,7 @@ def _worst_run(record: Record) -> Picture | None:
 
     def paint_runs(axes: Axes) -> None:
         axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
-        points(axes, record.run_numbers.astype(float), means, EACH, "mean of a run")
+        points(axes, record.run_numbers.astype(float), means, EACH_RUN, "mean of a run")
         points(axes, np.array([float(number)]), means[[worst]], WORST, f"run {number}")
         axes.set_ylabel("mean NEES")
         _span_runs(axes, record)
@@ -377,7 +377,7 @@ def _single_nees(record: Record) -> Picture | None:
         axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
         label = f"NEES of {each.replace('one', 'a')}"
         for values in rows:
-            points(axes, x, values, EACH, label)
+            points(axes, x, values, EACH_RUN, label)
             label = ""
         axes.set_ylabel("NEES")
         if record.independent:
@@ -460,7 +460,7 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
     def paint(axes: Axes) -> None:
         band(axes, clock.values, np.where(dof[:, None] > 0, ends, np.nan), "95 % band of one step")
         axes.axhline(1.0, **stroke(EXPECTED), label="expected")
-        points(axes, clock.values, ratio, EACH)
+        points(axes, clock.values, ratio, EACH_RUN)
         axes.set_ylabel("NIS / dof")
         clock.name(axes)
         if wide([ratio]):

@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.innovation_files import (
     refuse_options,
     stream_nis,
 )
-from consistency.referee.readers.formats.px4_log import SUFFIX, read_ulog
+from consistency.referee.readers.formats.px4_log import ULOG_SUFFIX, read_ulog
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import refused
@@ -81,9 +81,9 @@ def read_innovations(
     InputError
         Something cannot be used, or there are several filters or runs and none is named.
     """
-    if path.suffix.lower() == SUFFIX or is_dataflash(path):
+    if path.suffix.lower() == ULOG_SUFFIX or is_dataflash(path):
         refuse_options(path, r)
-    if path.suffix.lower() == SUFFIX:
+    if path.suffix.lower() == ULOG_SUFFIX:
         return read_ulog(path, filter_name, run)
     if is_dataflash(path):
         return read_stated(path, choose(path, "filter", list(STATED), filter_name), run)

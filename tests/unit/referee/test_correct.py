@@ -14,7 +14,7 @@ from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, held_out_by, with_uncertainty
 from consistency.referee.fit_covariance.factors import (
-    Block,
+    FactorBlock,
     Factors,
     blocks_of,
     fit_alone,
@@ -128,7 +128,9 @@ def test_runs_are_the_unit(rng):
 
 def test_a_covariance_is_scaled_by_blocks():
     P = np.array([[4.0, 1.0, 0.2], [1.0, 5.0, 0.3], [0.2, 0.3, 0.1]])
-    factors = Factors((Block("position", (0, 1)), Block("attitude", (2,))), np.array([9.0, 4.0]), np.array([0.5, 0.0]))
+    factors = Factors(
+        (FactorBlock("position", (0, 1)), FactorBlock("attitude", (2,))), np.array([9.0, 4.0]), np.array([0.5, 0.0])
+    )
     expected = [[36.5, 9.0, 1.2], [9.0, 45.5, 1.8], [1.2, 1.8, 0.4]]
     assert factors.applied(P) == pytest.approx(np.array(expected))
 

@@ -34,7 +34,7 @@ from consistency.referee.document.colours import style
 from consistency.referee.document.compared_filters import comparison_table
 from consistency.referee.document.guard import rejection_cells, rejection_text
 from consistency.referee.document.judged_filters import FURTHER, TERMINAL, cells, document, page, with_values
-from consistency.referee.document.map import COLUMNS, map_cells, map_lines, map_text
+from consistency.referee.document.map import MAP_COLUMNS, map_cells, map_lines, map_text
 from consistency.referee.document.needed_runs import plan_lines
 from consistency.referee.document.wording import PLAIN, PRINTED, fragment, unbroken, written
 from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
@@ -222,7 +222,7 @@ def test_the_score_of_a_map_in_every_view():
     assert map_text(bare) == "1.20 [0.90, 1.60] (2 of 42 landmarks left out)"
     joint = JointScore(*(Interval(x, x / 2, 2 * x) for x in (1.0, 2.0, 3.0)), 5, 80)
     judged = replace(bare, verdict=replace(verdict_of(1.0), joint=joint))
-    shown = dict(zip((column.head for column in COLUMNS), map(written, map_cells(judged)), strict=True))
+    shown = dict(zip((column.head for column in MAP_COLUMNS), map(written, map_cells(judged)), strict=True))
     assert shown["Pose and map together, NEES / dof"] == "1.00 [0.50, 2.00]"
     assert shown["Map given the pose, NEES / dof"] == "3.00 [1.50, 6.00]"
     assert map_lines({"a": bare, "b": judged, "c": replace(bare, landmarks=0)}) == [

@@ -12,7 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import systematic_errors as errors_
-from consistency.referee.fit_covariance.model_text import correction, data, noise_lines
+from consistency.referee.fit_covariance.model_text import correction, data_of_model, noise_lines
 from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import (
     BACKWARD,
@@ -294,11 +294,11 @@ def test_sentences_of_the_mean(model):
 
 
 def test_programs_have_the_evidence(model):
-    fit, mean = model.noise.mean_fit, data(model)["mean"]
+    fit, mean = model.noise.mean_fit, data_of_model(model)["mean"]
     assert fit is not None
     assert mean["low"] == fit.low.tolist()
     assert mean["free"] == fit.free.tolist()
     assert mean["instruments"] == fit.instruments
     plain = cs.fit_covariance(model.drives, "10m", correct=False)
     assert plain.noise.mean_fit is None
-    assert set(data(plain)["mean"]) == {"way", "turn", "drift_rad_per_m", "slip_m_per_rad"}
+    assert set(data_of_model(plain)["mean"]) == {"way", "turn", "drift_rad_per_m", "slip_m_per_rad"}

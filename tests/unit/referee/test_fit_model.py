@@ -20,7 +20,7 @@ from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.intervals import interval_of
 from consistency.referee.fit_covariance.likelihood import nees_of
 from consistency.referee.fit_covariance.mean_differences import TERMS, PersistentError, variance_between
-from consistency.referee.fit_covariance.model_text import noise_lines, sentence
+from consistency.referee.fit_covariance.model_text import model_sentence, noise_lines
 from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of, vectors_of
 from consistency.referee.fit_covariance.motion_windows import matrices_of as pieces_of
 from consistency.referee.fit_covariance.noise_model import caution
@@ -488,11 +488,11 @@ def test_terms_that_persist_are_named_from_five_drives_on(world, word, rng):
     assert [word in each.term and each.decides for each in model.lasting].count(True) == 1
     right = replace(model, spans=(replace(model.spans[0], whole=RIGHT, axes=(RIGHT,) * 3), *model.spans[1:]))
     assert right.status == "undecided"
-    assert "of the variance of an axis, so that new drives may have another covariance" in sentence(right)
+    assert "of the variance of an axis, so that new drives may have another covariance" in model_sentence(right)
     for term, decides in zip(TERMS, (True, True, False), strict=True):
         small = replace(right, lasting=(PersistentError(term, 0.1, 0.2),))
         assert small.status == ("undecided" if decides else "consistent")
-        assert ("new drives may" in sentence(small)) == decides
+        assert ("new drives may" in model_sentence(small)) == decides
     assert replace(right, lasting=()).status == "consistent"
     wrong = replace(RIGHT, low=2.0, value=2.5, high=3.0)
     assert replace(model, spans=(replace(model.spans[0], whole=wrong), *model.spans[1:])).status == "overconfident"

@@ -15,7 +15,7 @@ from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.mean_differences import TERMS, mean_by_motion, p_value_of, values_by_bin
-from consistency.referee.fit_covariance.model_text import correction, noise_lines, sentence
+from consistency.referee.fit_covariance.model_text import correction, model_sentence, noise_lines
 from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     angles,
@@ -111,8 +111,8 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng):
     assert found.values[0] == pytest.approx(1.0, abs=0.005)  # straight roads have no slip
     assert found.values[-1] < found.values[0] - 0.005
     assert before.status in ("inconsistent", "overconfident", "undecided")
-    assert "the scale of the way depends on the turn: x1" in sentence(before)
-    assert "correct the way by the turn with --by-turn" in sentence(before)
+    assert "the scale of the way depends on the turn: x1" in model_sentence(before)
+    assert "correct the way by the turn with --by-turn" in model_sentence(before)
     assert after.by_motion is not None
     assert not after.by_motion.is_found
     assert after.noise.mean.slip == pytest.approx(-0.2, abs=0.05)
@@ -120,8 +120,8 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng):
     assert f"slip_m_per_rad = {after.noise.mean.slip!r}" in snippets(after)["noise.toml"]
     assert after.noise.per_rad[0] < before.noise.per_rad[0] or after.noise.per_m[0] < before.noise.per_m[0]
     already = replace(before, noise=replace(before.noise, mean=after.noise.mean))
-    assert "--by-turn" not in sentence(already)
-    assert f"(add the square of {found.reach:.2g} m to the variance of x)" in sentence(already)
+    assert "--by-turn" not in model_sentence(already)
+    assert f"(add the square of {found.reach:.2g} m to the variance of x)" in model_sentence(already)
     right = replace(before.spans[0], whole=RIGHT, axes=(RIGHT,) * 3)
     shown = replace(before, spans=(right, *before.spans[1:]), lasting=())
     assert shown.status == "inconsistent"
@@ -238,9 +238,9 @@ def test_an_undecided_axis_makes_it_undecided_and_is_named(rng):
         assert ratio.value == pytest.approx(ratio_of(by_drive[:, axis], np.ones(3), True, dof).value)
     shown = replace(model, spans=(judged, *model.spans[1:]), lasting=(), by_motion=None)
     assert shown.status == "undecided"
-    assert sentence(shown).endswith("; undecided: yaw")
+    assert model_sentence(shown).endswith("; undecided: yaw")
     without_error = replace(judged, axes=(RIGHT, unknown, RIGHT))
-    assert "undecided" not in sentence(replace(shown, spans=(without_error, *model.spans[1:])))
+    assert "undecided" not in model_sentence(replace(shown, spans=(without_error, *model.spans[1:])))
 
 
 def test_what_decides_beside_the_ratio():

@@ -23,7 +23,14 @@ from consistency.referee.diagnostics.planning.single_log import (
     memory_of,
     within,
 )
-from consistency.referee.diagnostics.questions.independence import ALIKE, ENOUGH, FEWEST, RATE, SIZES, independence
+from consistency.referee.diagnostics.questions.independence import (
+    ALIKE,
+    ENOUGH,
+    FEWEST_PIECES,
+    RATE,
+    SIZES,
+    independence,
+)
 from consistency.referee.diagnostics.questions.lost_runs import early_ends
 from consistency.referee.diagnostics.verdict.answers import BIAS
 from consistency.referee.geometry.conventions import SPATIAL
@@ -213,7 +220,7 @@ def test_a_constant_part_is_undecided(share):
 def test_too_short_pieces_are_undecided():
     one = log(np.random.default_rng(5), 400, 0.9)
     v = judge(in_pieces(one))
-    assert (v.status, v.runs) == ("undecided", FEWEST)
+    assert (v.status, v.runs) == ("undecided", FEWEST_PIECES)
     assert "20 pieces of 20 steps are not shown to be independent: errors last over" in v.reasons[0]
     few = judge(in_pieces(log(np.random.default_rng(5), 4000), 10))
     assert "10 pieces of one log are too few, at least 20 are needed" in few.reasons[0]
@@ -357,17 +364,17 @@ def test_signs_and_what_takes_turns(rng):
 
 
 def test_scale_and_gaps_are_no_matter_and_few_are_not_asked(rng):
-    w = rng.normal(size=(FEWEST + 1, 3))
+    w = rng.normal(size=(FEWEST_PIECES + 1, 3))
     gap = np.insert(w, 5, np.nan, axis=0)
     a, b = independence(w), independence(7.0 * gap)
-    assert (a.pieces, b.pieces) == (FEWEST + 1, FEWEST + 1)
+    assert (a.pieces, b.pieces) == (FEWEST_PIECES + 1, FEWEST_PIECES + 1)
     assert b.p_value == pytest.approx(a.p_value)
-    assert np.isfinite(independence(w[:FEWEST]).p_value)
-    few = independence(w[: FEWEST - 1])
+    assert np.isfinite(independence(w[:FEWEST_PIECES]).p_value)
+    few = independence(w[: FEWEST_PIECES - 1])
     assert np.isnan(few.p_value)
     assert not few.doubtful
     assert not independence(np.zeros((50, 2))).doubtful
-    assert ENOUGH > FEWEST
+    assert ENOUGH > FEWEST_PIECES
     assert RATE < 0.005
 
 

@@ -14,11 +14,11 @@ from consistency.bench.pages.sections.nis import innovations
 from consistency.bench.pages.sections.one_run import pose_errors, world_map
 from consistency.bench.pages.sections.report_input import Study
 from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
-from consistency.referee.document.guard import COLUMNS as GUARD_COLUMNS
+from consistency.referee.document.guard import REJECTION_COLUMNS as GUARD_COLUMNS
 from consistency.referee.document.guard import rejection_cells
 from consistency.referee.document.judged_filters import BRIEF, FILTER, cells, columns
 from consistency.referee.document.judged_filters import FURTHER as FURTHER_COLUMNS
-from consistency.referee.document.map import COLUMNS as MAP_COLUMNS
+from consistency.referee.document.map import MAP_COLUMNS as MAP_COLUMNS
 from consistency.referee.document.map import map_cells
 from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
 from consistency.referee.pages.questions_table import diagnosis

@@ -32,7 +32,7 @@ from consistency.referee.diagnostics.verdict.parts import Answer, Equivalence, E
 from consistency.referee.types import Array
 
 DECLARED = ("independent", "per-run", "common")  # how errors of the truth depend on each other
-MOST = 0.5  # share of the truth in both covariances beyond which nothing is decided
+UNDECIDABLE = 0.5  # share of the truth in both covariances beyond which nothing is decided
 SHARED = 2.0  # (e + v)(e + v)' is at most twice ee' + vv', however e and v depend on each other
 
 
@@ -140,11 +140,11 @@ class UncertainTruth:
     @property
     def unjudged(self) -> str:
         """Why nothing is decided; '' where something may be."""
-        if self.contrasted or not self.share() > MOST:
+        if self.contrasted or not self.share() > UNDECIDABLE:
             return ""
         return (
             f"the truth is less certain than the estimates: its covariance is {100 * self.share():.0f} % of both, and "
-            f"at most {100 * MOST:.0f} % can be judged"
+            f"at most {100 * UNDECIDABLE:.0f} % can be judged"
         )
 
     # --- questions --------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from scipy import special
 
 from consistency.referee.types import Array
 
-FEWEST = 20  # pieces that are asked
+FEWEST_PIECES = 20  # pieces that are asked
 ENOUGH = (
     150  # pieces that show it: of sizes that continue as AR(.3) to AR(.99), fewer than 5 % of logs are then found at
 )
@@ -67,7 +67,7 @@ def independence(whitened: Array, nees: Array | None = None) -> Independence:
     """
     there = np.isfinite(whitened).all(axis=1)
     w = whitened[there]
-    if len(w) < FEWEST:
+    if len(w) < FEWEST_PIECES:
         return Independence(len(w), float("nan"), float("nan"), True)
     error_sizes = np.cbrt(np.square(w).sum(axis=1) if nees is None else nees[there])[:, None]
     shares = np.array([ALIKE, 1.0 - ALIKE])

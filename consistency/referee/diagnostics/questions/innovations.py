@@ -18,7 +18,7 @@ from consistency.referee.types import Array
 LAGS = 10
 IMPOSSIBLE, UNLIKELY = 1e-9, 1e-3  # probability that any innovation of a right filter is as large
 FEW = 0.05  # share of innovations that may be called outliers
-FEWEST = 400  # innovations; below, the chi-square of the portmanteau is not to be trusted
+FEWEST_INNOVATIONS = 400  # innovations; below, the chi-square of the portmanteau is not to be trusted
 FEWEST_EACH = 40  # innovations for each component, measured with up to 40 components
 
 
@@ -144,7 +144,7 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
     lags = min(lags, max(steps // 4, 1), max(steps - 1, 0))
     present = all_finite(u)
     unknown = Whiteness(np.full(0, np.nan), float("nan"), float("nan"), 0, float("nan"))
-    if lags == 0 or present.sum() < max(FEWEST, FEWEST_EACH * m):
+    if lags == 0 or present.sum() < max(FEWEST_INNOVATIONS, FEWEST_EACH * m):
         return unknown
     u = np.where(present[..., None], u, 0.0)
     power = float(np.square(u).sum() / (present.sum() * m))

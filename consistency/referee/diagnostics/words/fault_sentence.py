@@ -20,7 +20,12 @@ from consistency.referee.diagnostics.words.faults import (
 from consistency.referee.diagnostics.words.groups import groups_text
 from consistency.referee.diagnostics.words.numbers import SMALLEST_P, ratio_text
 
-NAMED = {"biased": BIAS, "heavy-tailed": ["outliers"], "overconfident": SCALE, "conservative": SCALE}  # by statuses
+CHIEF_QUESTIONS = {
+    "biased": BIAS,
+    "heavy-tailed": ["outliers"],
+    "overconfident": SCALE,
+    "conservative": SCALE,
+}  # by statuses
 
 
 def fault_sentence(v: Findings, s: Scale) -> str:
@@ -62,4 +67,4 @@ def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
     """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
     p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
     order = (SCALE, BIAS, SHAPE)
-    return questions != NAMED.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)
+    return questions != CHIEF_QUESTIONS.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)

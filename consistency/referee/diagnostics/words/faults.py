@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.words.numbers import (
 from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
-NAMED = 0.1  # part of a unit vector that a sentence names
+NAMED_PART = 0.1  # part of a unit vector that a sentence names
 
 # --- the scale ---------------------------------------------------------------------------------------
 
@@ -182,7 +182,7 @@ def _direction_text(v: Findings) -> str:
     assert v.axes.direction is not None
     u = v.axes.direction
     u = u * np.sign(u[np.argmax(np.abs(u))])
-    return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED)
+    return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED_PART)
 
 
 def _sizes_in_axes(off: dict[str, Interval]) -> str:

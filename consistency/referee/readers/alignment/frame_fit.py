@@ -21,8 +21,8 @@ from consistency.referee.readers.alignment.world_frames import (
 from consistency.referee.readers.truth_matching import Known, Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 
-STEP = 1e-6  # m or rad, over which the change of an error is taken
-ROUNDS = 20  # steps of a fit at most
+DIFFERENCE = 1e-6  # m or rad, over which the change of an error is taken
+FRAME_ROUNDS = 20  # steps of a fit at most
 DONE = 1e-3  # size of the last one, in stated standard deviations: the next is its square
 RANK = 1e-10  # of the largest singular value: directions that no error shows
 
@@ -67,10 +67,10 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
 
     def of_block(truth: Array, rows: Indices) -> Array:
         out = np.empty((len(rows), len(judged), len(free)))
-        for k, motion in enumerate(STEP * free):
+        for k, motion in enumerate(DIFFERENCE * free):
             after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
             before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
-            change = (after - before) / (2.0 * STEP)
+            change = (after - before) / (2.0 * DIFFERENCE)
             out[:, :, k] = _whitened(p, rows, change, judged)
         return out
 
@@ -105,7 +105,7 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     nees, found = at(frame)
     if not any(len(sound.rows) for _, sound in found):
         raise InputError(f"--align: no estimate of {name} has a truth and a covariance of full rank to be aligned by")
-    for _ in range(ROUNDS):
+    for _ in range(FRAME_ROUNDS):
         step, size = _step(found, free, judged)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
@@ -128,12 +128,12 @@ def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[in
         whitened.append(sound.whitened.ravel())
     A = np.concatenate(tangents)
     w = np.concatenate(whitened)
-    scale = _sizes(A)
+    scale = _column_norms(A)
     step = -np.linalg.lstsq(A / scale, w, rcond=RANK)[0] / scale
     return step, float(np.linalg.norm(A @ step))
 
 
-def _sizes(A: Array) -> Array:
+def _column_norms(A: Array) -> Array:
     size = np.sqrt(np.square(A).sum(axis=0))
     return np.where(size > 0, size, 1.0)
 
@@ -141,7 +141,7 @@ def _sizes(A: Array) -> Array:
 def orthonormal(tangents: Sequence[Array]) -> list[Array]:
     """Columns Q, (k, n, d) of each run, that span the tangents of one frame of all runs; fewer where some are 0."""
     A = np.concatenate([each.reshape(-1, each.shape[-1]) for each in tangents])
-    U, s, _ = np.linalg.svd(A / _sizes(A), full_matrices=False)
+    U, s, _ = np.linalg.svd(A / _column_norms(A), full_matrices=False)
     U = U[:, s > RANK * s[0]]
     bases = []
     start = 0

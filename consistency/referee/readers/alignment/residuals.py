@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.verdict.answers import BIAS, GROUP, INNOVAT
 from consistency.referee.errors import InputError
 from consistency.referee.readers.alignment.frame_fit import Sound, frame_of_least_nees, orthonormal, sound_of, tangent
 from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, positions, rotations
-from consistency.referee.readers.clock_offset import ROUNDS, SETTLED, clock_shift
+from consistency.referee.readers.clock_offset import CLOCK_ROUNDS, SETTLED, clock_shift
 from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array
 
@@ -93,7 +93,7 @@ def clocks_and_frames(
     shift = 0.0
     if isinstance(time_offset, float):
         shift = time_offset
-    for _ in range(ROUNDS):
+    for _ in range(CLOCK_ROUNDS):
         before = shift
         later = [p.later(shift) for p in runs]
         frames = frames_of(name, later, align, judged)
@@ -136,7 +136,7 @@ def aligned(
         frames = frames_of(name, runs, mode, judged)
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    sizes = _sizes(name, mode, frames)
+    sizes = _sizes_in_words(name, mode, frames)
     return replace(found, align=mode, notes=(sizes, *found.notes))
 
 
@@ -220,7 +220,7 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
 # --- words --------------------------------------------------------------------------------------------------
 
 
-def _sizes(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
+def _sizes_in_words(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
     if len(frames) == 1 or mode.endswith("-all"):
         x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
         turned = f"turned by ({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"

@@ -29,7 +29,7 @@ from consistency.referee.readers.formats.innovation_files import (
 from consistency.referee.readers.places import listed
 from consistency.referee.types import Array
 
-SUFFIX = ".bin"
+DATAFLASH_SUFFIX = ".bin"
 BEGIN = b"\xa3\x95\x80"  # of the message that declares the first format
 EKFS = {"XKF4": "EK3", "NKF4": "EK2"}  # message with the test ratios, and the prefix of the filter's parameters
 TILT = "NKF4"  # whose SVT is a measure of the tilt error
@@ -75,7 +75,7 @@ class Messages(NamedTuple):
 
 
 def is_dataflash(path: Path) -> bool:
-    return path.suffix.lower() == SUFFIX
+    return path.suffix.lower() == DATAFLASH_SUFFIX
 
 
 def read_ratios(path: Path, sensor: str | None = None, core: int | None = None) -> tuple[list[GateRatios], list[str]]:

@@ -37,7 +37,7 @@ STATED = {
     CENTRED: "sdx sdy sdz sdxy sdyz sdzx",
     BASELINE: "sde sdn sdu sden sdnu sdue",
 }  # deviations, and the roots of cross terms
-AXES = {"e": 0, "n": 1, "u": 2, "x": 0, "y": 1, "z": 2}
+AXIS_OF_LETTER = {"e": 0, "n": 1, "u": 2, "x": 0, "y": 1, "z": 2}
 QUALITY = {1: "fixed", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 
 
@@ -281,7 +281,7 @@ def _covariance(path: Path, columns: dict[str, Array], stated: Sequence[str]) ->
         if f"{name}(m)" not in columns:
             raise InputError(f"{path}: column '{name}(m)' is missing, of the deviations of the position")
         root = columns[f"{name}(m)"]
-        i = AXES[name[2]]
-        j = AXES[name[-1]]
+        i = AXIS_OF_LETTER[name[2]]
+        j = AXIS_OF_LETTER[name[-1]]
         P[:, i, j] = P[:, j, i] = root * np.abs(root)
     return P

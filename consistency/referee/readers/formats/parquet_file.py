@@ -44,11 +44,11 @@ def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"{path}: column '{one_line(twice[0])}' is duplicated")
     with reading(path, refusal):
-        columns = {name: _cells(name, column) for name, column in zip(names, table.columns, strict=True)}
+        columns = {name: _cells_of_column(name, column) for name, column in zip(names, table.columns, strict=True)}
         return columns, table.num_rows
 
 
-def _cells(name: str, column: Any) -> Array:
+def _cells_of_column(name: str, column: Any) -> Array:
     if pa.types.is_decimal(column.type):
         column = column.cast(pa.float64())
     if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):

@@ -12,7 +12,7 @@ from consistency.referee.geometry.conventions import INERTIAL, SPATIAL
 from consistency.referee.readers.clock_units import nothing_near
 from consistency.referee.readers.formats.columns import is_numbered
 from consistency.referee.readers.formats.file_head import head_of
-from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POSE, SPLIT, TRIANGLE
+from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, POSE_NUMBERS, SPLIT, TRIANGLE
 from consistency.referee.readers.formats.text_blocks import Lines, read_numbers
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import refuse
@@ -32,12 +32,12 @@ def components_in(numbers: int) -> int | None:
 
 def components_of(lines: Lines) -> int:
     """Components whose covariance or deviations stand behind the poses; those of a pose where none do."""
-    return components_in(lines.values.shape[1] - POSE) or 6
+    return components_in(lines.values.shape[1] - POSE_NUMBERS) or 6
 
 
 def covariances_in(lines: Lines, order: str) -> Array | None:
     """Covariances (N, n, n), translation first, that stand behind the poses; None without any."""
-    numbers = lines.values[:, POSE:]
+    numbers = lines.values[:, POSE_NUMBERS:]
     if not numbers.shape[1]:
         return None
     if lines.values.shape[1] != SPLIT:

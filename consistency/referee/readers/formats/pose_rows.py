@@ -28,14 +28,14 @@ from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import finite_rows
 from consistency.referee.types import Array, Indices
 
-POSE = 8  # columns of a pose
+POSE_NUMBERS = 8  # columns of a pose
 SPLIT = 20  # of a pose and two 3 x 3 covariances without a cross-covariance
 FULL = 36  # numbers of a 6 x 6 covariance row by row
 TRIANGLE = 21  # of its upper triangle
 POINT = 4  # columns of a truth of positions alone: t, x, y, z
 DEVIATIONS = (6, 9, 15)  # of a pose, with a velocity, with two biases
-DEVIATED = POSE + 6  # columns of a pose and six standard deviations
-TUM = (POSE, SPLIT, POSE + TRIANGLE, POSE + FULL)
+DEVIATED = POSE_NUMBERS + 6  # columns of a pose and six standard deviations
+TUM = (POSE_NUMBERS, SPLIT, POSE_NUMBERS + TRIANGLE, POSE_NUMBERS + FULL)
 ASL = 17  # columns of the truth of EuRoC: t in ns, position, quaternion w first, velocity, two biases
 MATRICES = {12: 0, 13: 1, 16: 0, 17: 1}  # by columns of a matrix, 3 x 4 or 4 x 4, and of its time or number: the latter
 STATED = (0, TRIANGLE, FULL)  # columns of a covariance behind a matrix
@@ -86,12 +86,12 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
     InputError
         They are positions without orientations.
     """
-    if lines.values.shape[1] < POSE:
+    if lines.values.shape[1] < POSE_NUMBERS:
         raise InputError(
             f"{lines.path}: holds positions without orientations, and a planar pose needs a heading; give a file with "
             "a heading or a quaternion, or judge positions alone: --state x,y with a truth table of columns t, x, y"
         )
-    ahead = Rotation.from_quat(lines.values[:, 4:POSE]).apply([1.0, 0.0, 0.0])
+    ahead = Rotation.from_quat(lines.values[:, 4:POSE_NUMBERS]).apply([1.0, 0.0, 0.0])
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
     t, x, y = lines.values[:, :3].T
     columns = {"t": t, "x": x, "y": y, "heading": heading}
@@ -175,7 +175,7 @@ def _unnamed(path: Path, true: bool, head: Head | None) -> Lines:
     if width == ASL and not _are_rigid(lines.values[:, 1:]).all():
         return _asl(lines, true)
     if width in MATRIX_WIDTHS and (width not in STATES or _are_rigid(_matrix(lines)[1]).all()):
-        return _matrices(lines)
+        return _poses_of_matrices(lines)
     states = as_states(increasing(lines))
     if states is None:
         raise InputError(f"{lines.place(0)}: has {width} columns; should be {LAYOUT}")
@@ -189,7 +189,7 @@ def _asl(lines: Lines, true: bool) -> Lines:
     note = f"{lines.path}: read as EuRoC {of}, {ASL} columns, {UNIT_NAMES[unit]}, quaternion w first"
     pose = lines.values[:, [1, 2, 3, 5, 6, 7, 4]]
     values = np.column_stack([t, pose])
-    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE:]))
+    return increasing(replace(lines, values=values, note=note, rest=lines.values[:, POSE_NUMBERS:]))
 
 
 def _matrix(lines: Lines) -> tuple[Array, Array, Array]:
@@ -208,7 +208,7 @@ def _are_rigid(numbers: Array) -> Indices:
     return np.asarray(right | ~finite_rows(numbers))
 
 
-def _matrices(lines: Lines) -> Lines:
+def _poses_of_matrices(lines: Lines) -> Lines:
     """Matrices that turn body into world coordinates, row by row, behind a time or a number or neither."""
     before, numbers, covariance = _matrix(lines)
     what = f"the {numbers.shape[1]} numbers are not a rotation and translation, row by row"

@@ -25,7 +25,7 @@ from consistency.referee.readers.formats.file_kinds import (
 )
 from consistency.referee.readers.formats.pose_covariances import ORDERS, components_in, covariance_order
 from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, TRIANGLE
-from consistency.referee.readers.formats.pose_rows import POSE as POSE_NUMBERS
+from consistency.referee.readers.formats.pose_rows import POSE_NUMBERS as POSE_NUMBERS
 from consistency.referee.readers.formats.text_blocks import opened
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import STATE

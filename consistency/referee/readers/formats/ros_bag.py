@@ -20,7 +20,7 @@ from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
 from consistency.referee.readers.formats.geodetic import Fixes
 from consistency.referee.readers.formats.pose_covariances import require_spatial
-from consistency.referee.readers.formats.pose_rows import FULL, POSE
+from consistency.referee.readers.formats.pose_rows import FULL, POSE_NUMBERS
 from consistency.referee.readers.formats.rotations import not_unit
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.formats.tum import SpaceRun, poses_without_covariances, space_estimator
@@ -94,7 +94,7 @@ def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
         run = _run_on(bag, reader, r, _chosen(bag, reader, r.topic), ", of poses or PARENT:CHILD of /tf")
-    numbers = 4 if isinstance(run.true, Fixes) else POSE  # of a row before its covariance
+    numbers = 4 if isinstance(run.true, Fixes) else POSE_NUMBERS  # of a row before its covariance
     if r.truth_covariance not in (None, COLUMNS):
         raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
     if r.truth_covariance is not None and not (run.true.values[:, numbers:] > 0).any():
@@ -287,12 +287,12 @@ def _track(bag: Path, topic: str, rows: Iterable[Array]) -> Lines:
         raise InputError(f"{bag}: {topic} holds no message")
     t, first = np.unique(values[:, 0], return_index=True)
     values = values[first]
-    bad, length = not_unit(values[:, 1:POSE])
+    bad, length = not_unit(values[:, 1:POSE_NUMBERS])
     for row in np.flatnonzero(bad):
         what = f"the quaternion at {t[row]:.15g} s has length {length[row]:.4g}, not 1"
         raise InputError(f"{bag}, {topic}: {what}")
-    columns = dict(zip(TWIST, values[:, POSE + FULL :].T, strict=False))
-    return Lines(bag, values[:, : POSE + FULL], first + 1, unit=f"message of {topic}", columns=columns)
+    columns = dict(zip(TWIST, values[:, POSE_NUMBERS + FULL :].T, strict=False))
+    return Lines(bag, values[:, : POSE_NUMBERS + FULL], first + 1, unit=f"message of {topic}", columns=columns)
 
 
 def _twist(message: Any) -> list[float]:
@@ -354,7 +354,7 @@ def _transforms(bag: Path, reader: Any, frames: str) -> Lines:
     T = np.eye(4)
     for link, forward in chain:
         own = tracks[link]
-        poses = truth_at(t, own.t, own.values[:, 1:POSE], "spatial", np.inf).truth
+        poses = truth_at(t, own.t, own.values[:, 1:POSE_NUMBERS], "spatial", np.inf).truth
         step = matrices(poses)
         T = T @ (step if forward else inverse(step))
     unstated = np.full((len(t), FULL), np.nan)

@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS_LAYOUT,
     FULL,
     POINT,
-    POSE,
+    POSE_NUMBERS,
     SPLIT,
     States,
     read_beside,
@@ -191,7 +191,7 @@ def _stated(own: Lines) -> Stated:
         return ALONE if own.alone else POINTS
     if isinstance(own, States):
         return SINGLE
-    if width - POSE in DEVIATIONS:
+    if width - POSE_NUMBERS in DEVIATIONS:
         return ALONE
     return BLOCKS if width == SPLIT else WHOLE
 
@@ -239,7 +239,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     order = r.covariance_order or ORDERS[0]
     P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
     of_truth = _of_truth(true, own, order, r)
-    run = replace(run, own=own.of(slice(0, POSE)))  # without the covariances, of which P has a copy
+    run = replace(run, own=own.of(slice(0, POSE_NUMBERS)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
     poses = replace(poses, cross=cross, true_covariance=of_truth, by=by)
     if _is_point(true):
@@ -312,7 +312,7 @@ def _covariances(
 
 def _states(lines: Lines, k: int) -> Array:
     """Poses with the first ``k`` numbers of velocity and biases behind them, (N, 7 + k)."""
-    pose = lines.values[:, 1:POSE]
+    pose = lines.values[:, 1:POSE_NUMBERS]
     if lines.rest is None or not k:
         return pose
     return np.column_stack([pose, lines.rest[:, :k]])
@@ -336,7 +336,7 @@ def judged_rest(own: Lines, true: Lines, r: Reading) -> tuple[int, str]:
 
 def _unused(truth: Lines, r: Reading) -> str:
     """A note on a covariance of the truth that nothing is done with, "" without one."""
-    stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE:] > 0).any())
+    stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE_NUMBERS:] > 0).any())
     if r.truth_covariance is not None or not stated or isinstance(truth, States):
         return ""
     return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
@@ -380,7 +380,7 @@ def read_trajectory(path: Path, true: bool = False, columns: Columns | None = No
 
 def _checked(lines: Lines, true: bool = True) -> Lines:
     """Poses whose quaternions have unit length, and which are finite if they are a truth."""
-    pose = lines.values[:, 1:POSE]
+    pose = lines.values[:, 1:POSE_NUMBERS]
     if true:
         refuse(~finite_rows(pose), lines.place, "the truth is not finite; leave such lines out")
     if _is_point(lines):

@@ -49,7 +49,7 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     convention = runs[0].convention
     n = runs[0].covariance.shape[-1]
     if kind == "spatial" and n > 6:
-        return list(_blocks(n))
+        return list(_swapped_blocks(n))
     scales = [*_roots(runs, part), *_singular(runs, axes, part)]
     if kind == "vector":
         covariances = _permuted(axes, len(axes))
@@ -181,7 +181,7 @@ def _inverted(P: Array, part: list[int]) -> Array:
     return out
 
 
-def _blocks(n: int) -> Iterator[Guess]:
+def _swapped_blocks(n: int) -> Iterator[Guess]:
     """Blocks of three of the covariance of an inertial state in another order; biases at its end, in theirs."""
     names = np.array(["p", "R", "v", "bg", "ba"])
     behind = list(range(3, n // 3))

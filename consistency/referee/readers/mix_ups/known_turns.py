@@ -21,7 +21,7 @@ Axes = Callable[[Poses, list[int]], Array]  # columns (N, d, d) of axes at each 
 
 def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
     """Possible mix-ups of the axes of the covariance of positions, and of velocities beside them."""
-    blocks = _blocks(runs[0], [axis.lower() for axis in axes])
+    blocks = _position_blocks(runs[0], [axis.lower() for axis in axes])
     if not blocks or runs[0].convention not in IN_WORLD:
         return
     if not any(np.ptp(p.estimate[:, blocks[0]], axis=0).any() for p in runs if len(p.t)):
@@ -39,7 +39,7 @@ def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
     yield _turned(words, _wrong_way, blocks)
 
 
-def _blocks(p: Poses, axes: Sequence[str]) -> list[list[int]]:
+def _position_blocks(p: Poses, axes: Sequence[str]) -> list[list[int]]:
     """Places of the positions, and of velocities along the same axes; none where the state has no positions."""
     if p.manifold != "vector":
         poses_alone = p.covariance.shape[-1] <= 6

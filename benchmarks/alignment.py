@@ -25,9 +25,8 @@ from script_options import options_of
 
 from consistency.diagnostics import Record, Settings, Verdict, judge
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.alignment.residuals import Aligned, clocks_and_frames
-from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
-from consistency.referee.readers.clock_offset import clock_shift
+from consistency.referee.readers.alignment import Aligned, WorldTransform, clocks_and_frames, moved
+from consistency.referee.readers.clocks import clock_shift
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array

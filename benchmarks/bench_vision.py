@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from bench_trials import SEED, Work, interleaved
 
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 from consistency.referee.errors import InputError
-from consistency.referee.system.shipped import data_folder
+from consistency.referee.system.folders import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.registration import rigid_motions
 from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence

@@ -22,13 +22,7 @@ import numpy as np
 from calibration_gates import row
 from numpy.typing import NDArray
 
-from consistency.referee.diagnostics.monitoring.monitor import (
-    EXPONENT,
-    LARGEST,
-    bet_on,
-    rest_after_rejection,
-    start_share,
-)
+from consistency.referee.diagnostics.monitor import EXPONENT, LARGEST, bet_on, rest_after_rejection, start_share
 
 Array = NDArray[Any]
 

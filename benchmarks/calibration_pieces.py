@@ -13,10 +13,9 @@ from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics import Record, judge
-from consistency.referee.diagnostics.planning.single_log import in_pieces
+from consistency.referee.diagnostics.questions.planning import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.lie_groups import spatial_error
+from consistency.referee.geometry import SPATIAL, spatial_error
 from consistency.referee.types import Array
 
 STEPS, DOF, RHO = 20_000, 3, 0.95

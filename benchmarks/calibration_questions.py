@@ -15,7 +15,7 @@ from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics import Record, Verdict, judge, mean_shape
-from consistency.referee.diagnostics.verdict.answers import SHARES, STEP
+from consistency.referee.diagnostics.verdict.parts import SHARES, STEP
 from consistency.referee.types import Array
 
 RATES = (0.05, 1e-3)  # of commands and of gates

@@ -18,7 +18,7 @@ from scipy import special, stats
 from consistency.diagnostics import Record, judge, ratio_interval
 from consistency.referee.diagnostics.comparison import RunSummary, compare
 from consistency.referee.diagnostics.questions import scale
-from consistency.referee.diagnostics.verdict.answers import SHARES
+from consistency.referee.diagnostics.verdict.parts import SHARES
 from consistency.referee.types import Array
 
 STEPS, GATE_STEPS = 2000, 100

@@ -28,8 +28,8 @@ from calibration_gates import (
 from scipy import special
 
 from consistency.diagnostics import Record
-from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.readers.formats.numpy_archive import steps_of
+from consistency.referee.geometry import planar_error
+from consistency.referee.readers.formats.archives import steps_of
 from consistency.referee.readers.runs_to_record import Track, assemble, symmetric
 from consistency.referee.types import Array
 

@@ -19,15 +19,14 @@ import numpy as np
 from script_options import options_of
 
 import consistency as cs
-from consistency.bench.models import point, stereo
+from consistency.bench.models import observation
 from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor
-from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
+from consistency.bench.scenario.observations import BiasMap, DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
-from consistency.stereo.characterising.characterise import Characterisation, characterise
+from consistency.stereo.characterising.characterise import Characterisation, characterise, residuals_of
 from consistency.stereo.characterising.sensor_text import believed_sensor
-from consistency.stereo.characterising.truth_residuals import residuals_of
 
 SCENARIO = "herath2007-stereo"
 EVERYTHING = (1e-6, 1e6)  # px: a search range that leaves nothing out
@@ -65,8 +64,8 @@ def _changed(trial: Trial, scenario: Scenario, of: Real) -> Trial:
     assert trial.truth is not None
     assert trial.landmarks is not None
     step = trial.step
-    body = point.to_robot(*trial.truth[step].T, *trial.landmarks[trial.landmark].T)
-    ideal = np.stack(stereo.project(*point.to_sensor(*body, sensor.mount.packed()), *sensor.rig), axis=-1)
+    body = observation.to_robot(*trial.truth[step].T, *trial.landmarks[trial.landmark].T)
+    ideal = np.stack(observation.project(*observation.to_sensor(*body, sensor.mount.packed()), *sensor.rig), axis=-1)
     noise = trial.z - ideal
     if of.growth is not None:
         noise[:, 2] *= of.growth.ratio_at(ideal[:, 2])

@@ -24,7 +24,7 @@ from scipy import stats
 from script_options import options_of
 
 from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.groups_by_column import Groups
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval

@@ -29,12 +29,17 @@ from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.mean_differences import mean_by_motion, persistent_errors
 from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
 from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.refusals import doubts, require_sound, rotation_growth
+from consistency.referee.fit_covariance.refusals import (
+    doubts,
+    mean_by_motion,
+    persistent_errors,
+    require_sound,
+    rotation_growth,
+)
 from consistency.referee.fit_covariance.white_noise import fit_noise, terms_of, variance_intervals
-from consistency.referee.geometry.lie_groups import composed, matrices, vectors
+from consistency.referee.geometry import composed, matrices, vectors
 from consistency.referee.types import Array
 
 SPAN, STEP, LENGTH = "10m", 0.5, 1000.0  # m

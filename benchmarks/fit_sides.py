@@ -26,7 +26,7 @@ from consistency.referee.fit_covariance.drives import Drive
 from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
 from consistency.referee.fit_covariance.systematic_errors import MeanFit
 from consistency.referee.fit_covariance.white_noise import fit_noise, jitter_of
-from consistency.referee.geometry.lie_groups import composed, matrices
+from consistency.referee.geometry import composed, matrices
 from consistency.referee.types import Array
 
 STEP, LENGTH = 0.05, 120.0  # m

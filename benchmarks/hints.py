@@ -31,9 +31,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from script_options import options_of
 
-from consistency.referee.geometry import wrap
-from consistency.referee.geometry.lie_groups import matrices, vectors
-from consistency.referee.readers.alignment.world_frames import WorldTransform, moved, skew
+from consistency.referee.geometry import matrices, vectors, wrap
+from consistency.referee.readers.alignment import WorldTransform, moved, skew
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.diagnostics import Verdict, judge
-from consistency.referee.geometry.lie_groups import composed, vectors
-from consistency.referee.readers.formats.geodetic import axes_at, centred, geodetic
+from consistency.referee.geometry import composed, vectors
+from consistency.referee.readers.formats.positions import axes_at, centred, geodetic
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.types import Array

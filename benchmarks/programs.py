@@ -29,8 +29,8 @@ from scipy import stats
 from script_options import options_of
 
 import consistency as cs
+from consistency.referee.programs.process import program_of
 from consistency.referee.programs.study import Plan, run_study
-from consistency.referee.programs.words import program_of
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.program_runs import Runs
 from consistency.referee.system.progress import quiet

@@ -22,12 +22,12 @@ from script_options import options_of
 
 from consistency.diagnostics import Record, Verdict
 from consistency.referee.diagnostics.statistics.number_of_runs import power_of
-from consistency.referee.diagnostics.verdict.answers import MAIN, SHARES
-from consistency.referee.geometry.lie_groups import composed, propagated, to_left, vectors
+from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES
+from consistency.referee.geometry import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places
+from consistency.referee.readers.runs_to_record import relative_of
 from consistency.referee.readers.truth_matching import Manifold, Poses
-from consistency.referee.readers.windows import relative_of
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import judge_all
 

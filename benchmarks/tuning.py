@@ -23,11 +23,8 @@ from scipy import stats
 from script_options import options_of
 
 import consistency as cs
-from consistency.bench.tuning.fit_and_verdict_trials import parts_of
-from consistency.bench.tuning.innovation_likelihood import BeliefScorer
-from consistency.bench.tuning.noise_factor_fit import FactorFit
-from consistency.bench.tuning.noise_groups import noise_groups_of, scaled
-from consistency.bench.tuning.tune import fitted
+from consistency.bench.tuning.noise_factor_fit import BeliefScorer, FactorFit, noise_groups_of, scaled
+from consistency.bench.tuning.tune import fitted, parts_of
 from consistency.bench.types import Trial
 from consistency.referee.types import Array
 

@@ -6,7 +6,7 @@ from typing import Any
 # where each public name stands; it is loaded when it is first used, so that `import consistency` and `--help` stay
 # fast, and the core works without the packages of the bench. __init__.pyi has the same names for type checkers.
 _MODULES = {
-    "Alarm": "referee.diagnostics.monitoring.monitor",
+    "Alarm": "referee.diagnostics.monitor",
     "Control": "bench.types",
     "Correction": "referee.fit_covariance.correct",
     "Drive": "referee.fit_covariance.drives",
@@ -15,7 +15,7 @@ _MODULES = {
     "Info": "bench.types",
     "InputError": "referee.errors",
     "Log": "bench.store.recorded_log",
-    "Monitor": "referee.diagnostics.monitoring.monitor",
+    "Monitor": "referee.diagnostics.monitor",
     "NoiseModel": "referee.fit_covariance.noise_model",
     "Observation": "bench.types",
     "Record": "referee.diagnostics.records.record",
@@ -23,9 +23,9 @@ _MODULES = {
     "Scenario": "bench.scenario",
     "Study": "bench.runs.reproduce_findings",
     "Trial": "bench.types",
-    "Tuning": "bench.tuning.tuning_result",
+    "Tuning": "bench.tuning.tune",
     "Verdict": "referee.diagnostics.verdict.verdict",
-    "analyse": "bench.runs.analyse_results",
+    "analyse": "bench.runs.results_to_records",
     "anees": "referee.diagnostics.statistics.nees",
     "anees_interval": "referee.diagnostics.statistics.nees",
     "correct": "referee.fit_covariance.correct",
@@ -36,7 +36,7 @@ _MODULES = {
     "guarded": "bench.filters.compiled",
     "judge": "referee.notebook.read_and_judge",
     "load_scenario": "bench.scenario",
-    "monte_carlo": "referee.programs.from_python",
+    "monte_carlo": "referee.programs.study",
     "nees": "referee.diagnostics.statistics.nees",
     "read": "referee.notebook.read_and_judge",
     "read_drives": "referee.fit_covariance.drives",

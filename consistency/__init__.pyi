@@ -3,9 +3,9 @@
 from .bench.filters import filter_names as filter_names
 from .bench.filters import get_filter as get_filter
 from .bench.filters.compiled import guarded as guarded
-from .bench.runs.analyse_results import analyse as analyse
 from .bench.runs.montecarlo import run_trials as run_trials
 from .bench.runs.reproduce_findings import Study as Study
+from .bench.runs.results_to_records import analyse as analyse
 from .bench.scenario import Scenario as Scenario
 from .bench.scenario import load_scenario as load_scenario
 from .bench.scenario import scenario_names as scenario_names
@@ -14,16 +14,16 @@ from .bench.store.recorded_log import Log as Log
 from .bench.store.recorded_log import read_log as read_log
 from .bench.store.results import Results as Results
 from .bench.store.results import read_results as read_results
+from .bench.tuning.tune import Tuning as Tuning
 from .bench.tuning.tune import tune as tune
-from .bench.tuning.tuning_result import Tuning as Tuning
 from .bench.types import Control as Control
 from .bench.types import Finding as Finding
 from .bench.types import Gaussian as Gaussian
 from .bench.types import Info as Info
 from .bench.types import Observation as Observation
 from .bench.types import Trial as Trial
-from .referee.diagnostics.monitoring.monitor import Alarm as Alarm
-from .referee.diagnostics.monitoring.monitor import Monitor as Monitor
+from .referee.diagnostics.monitor import Alarm as Alarm
+from .referee.diagnostics.monitor import Monitor as Monitor
 from .referee.diagnostics.records.record import Record as Record
 from .referee.diagnostics.statistics.nees import anees as anees
 from .referee.diagnostics.statistics.nees import anees_interval as anees_interval
@@ -39,4 +39,4 @@ from .referee.fit_covariance.noise_model import NoiseModel as NoiseModel
 from .referee.fit_covariance.noise_model import fit_covariance as fit_covariance
 from .referee.notebook.read_and_judge import judge as judge
 from .referee.notebook.read_and_judge import read as read
-from .referee.programs.from_python import monte_carlo as monte_carlo
+from .referee.programs.study import monte_carlo as monte_carlo

@@ -2,47 +2,55 @@
 
 from consistency.referee.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
 from consistency.referee.diagnostics.judge_record import follow, judge, look, speaks
-from consistency.referee.diagnostics.maps.map_nees import map_score
-from consistency.referee.diagnostics.maps.rejected_observations import clustered_share, rejection_score
-from consistency.referee.diagnostics.monitoring.monitor import Alarm, Monitor
-from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
-from consistency.referee.diagnostics.planning.pilot import PilotPlan, pilot_plan
-from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
-from consistency.referee.diagnostics.questions.bias import Hotelling, hotelling, t_squared
-from consistency.referee.diagnostics.questions.equivalence import equivalence
-from consistency.referee.diagnostics.questions.independence import Independence, independence
-from consistency.referee.diagnostics.questions.innovations import Whiteness, nis_of, nis_test, nis_whiteness, whiteness
-from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_bound
-from consistency.referee.diagnostics.questions.outliers import Outlier, outliers
-from consistency.referee.diagnostics.questions.scale import MeanTest, mean_test, ratio_interval
-from consistency.referee.diagnostics.questions.shape import (
+from consistency.referee.diagnostics.monitor import Alarm, Monitor
+from consistency.referee.diagnostics.questions.bias_and_shape import (
+    Hotelling,
     Largest,
+    hotelling,
     identity_statistic,
     largest_direction,
     mean_shape,
     sphericity,
+    t_squared,
 )
-from consistency.referee.diagnostics.records.record import Evidence, JointNees, MapRecord, Record, Rejections
-from consistency.referee.diagnostics.records.skipped_start import Skip
+from consistency.referee.diagnostics.questions.maps import clustered_share, map_score, rejection_score
+from consistency.referee.diagnostics.questions.planning import Design, PilotPlan, pilot_plan, sequential_design
+from consistency.referee.diagnostics.questions.scale import (
+    Band,
+    MeanTest,
+    equivalence,
+    mean_test,
+    ratio_interval,
+    simultaneous_band,
+)
+from consistency.referee.diagnostics.questions.tails import Outlier, early_ends, lost_bound, outliers
+from consistency.referee.diagnostics.questions.whiteness import (
+    Independence,
+    Whiteness,
+    independence,
+    nis_of,
+    nis_test,
+    nis_whiteness,
+    whiteness,
+)
+from consistency.referee.diagnostics.records.record import Evidence, JointNees, MapRecord, Record, Rejections, Skip
 from consistency.referee.diagnostics.records.whitening import spread_steps, standardise, whiten
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import (
-    coverage,
-    coverage_interval,
-    noncredibility,
-    rmse,
-)
+from consistency.referee.diagnostics.statistics.distributions import Normality, normality
 from consistency.referee.diagnostics.statistics.nees import (
     EProcess,
     Pit,
     anees,
     anees_interval,
     chi2_mean_interval,
+    coverage,
+    coverage_interval,
     e_process,
     ever,
     nees,
+    noncredibility,
     pit,
+    rmse,
 )
-from consistency.referee.diagnostics.statistics.normality import Normality, normality
 from consistency.referee.diagnostics.statistics.number_of_runs import (
     detectable_ratio,
     gate_runs,
@@ -50,7 +58,6 @@ from consistency.referee.diagnostics.statistics.number_of_runs import (
     power_of,
     required_runs,
 )
-from consistency.referee.diagnostics.verdict.answers import Settings, answers
 from consistency.referee.diagnostics.verdict.parts import (
     Answer,
     EarlyEnds,
@@ -58,6 +65,8 @@ from consistency.referee.diagnostics.verdict.parts import (
     Interval,
     NisTest,
     RejectionScore,
+    Settings,
+    answers,
 )
 from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
 

@@ -6,17 +6,19 @@ Only the stages and the chain need OpenCV, the extra ``vision``.
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-    from consistency.stereo.rendered_images.chain import Chain, Tracks
-    from consistency.stereo.rendered_images.sensor_tables import (
+    from consistency.stereo.rendered_images.chain import (
         Biases,
+        Chain,
         Growth,
+        Stops,
         TrackMeans,
+        Tracks,
         bias_map,
         disparity_growth,
+        stand,
         track_means,
     )
-    from consistency.stereo.rendered_images.stops import Stops, stand
+    from consistency.stereo.rendered_images.scene import Camera, Lens, StereoCamera
 
 __all__ = [
     "Biases",

@@ -14,8 +14,19 @@ from typing import Any
 import pytest
 from _pytest.reports import TestReport  # public under the name of pytest from 7.0 on
 
-from consistency.referee.gating.gate_terms import DEFAULTS, Entry, RunningTest, current, in_place_rate, watching
-from consistency.referee.gating.session_ledger import PROPERTY, STATISTICS, Ledger, path_fault, to_property
+from consistency.referee.gating.session import (
+    DEFAULTS,
+    PROPERTY,
+    STATISTICS,
+    Entry,
+    Ledger,
+    RunningTest,
+    current,
+    in_place_rate,
+    path_fault,
+    to_property,
+    watching,
+)
 
 NAME = "consistency-gates"
 MARKER = (
@@ -133,7 +144,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.referee.diagnostics.verdict.as_dictionary import plain
+            from consistency.referee.diagnostics.verdict.verdict import plain
 
             self.statistics.append(plain(entry.statistics))
 
@@ -161,7 +172,7 @@ class Gates:
             if session.exitstatus == pytest.ExitCode.OK:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
         if self.path is not None and not self.config.option.collectonly:
-            from consistency.referee.gating.gates_report import write_gates
+            from consistency.referee.gating.gate_results import write_gates
 
             write_gates(self.ledger, self.path)
 
@@ -176,7 +187,7 @@ class Gates:
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         if self.ledger.tests:
-            from consistency.referee.gating.gates_report import gate_lines
+            from consistency.referee.gating.gate_results import gate_lines
 
             terminalreporter.section("consistency gates")
             for line in gate_lines(self.ledger):

@@ -4,9 +4,8 @@ from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
     from consistency.bench.runs.backends.choose_executor import executor_for
-    from consistency.bench.runs.montecarlo import Interrupted, run_log, run_trials
+    from consistency.bench.runs.montecarlo import Interrupted, run_log, run_trials, run_until_decided
     from consistency.bench.runs.reproduce_findings import Study, read_findings, reproduce
-    from consistency.bench.runs.run_until_decided import run_until_decided
 
 __all__ = [
     "Interrupted",

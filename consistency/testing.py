@@ -13,23 +13,23 @@ from consistency.referee.diagnostics.comparison import FEWEST, Comparison
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.gating.candidate_and_reference import Sides, of_arrays, of_filters
-from consistency.referee.gating.checked_arrays import planned_dof, rate_shares, record_of_checked, record_of_filter
-from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide
-from consistency.referee.gating.gate_terms import (
-    Terms,
-    current,
-    fault_text,
-    few_to_compare,
-    terms,
-    undecided_text,
+from consistency.referee.gating.checked_input import (
+    Sides,
+    of_arrays,
+    of_filters,
+    planned_dof,
+    rate_shares,
+    record_of_checked,
+    record_of_filter,
 )
+from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide
+from consistency.referee.gating.session import Terms, current, fault_text, few_to_compare, terms, undecided_text
 
 if TYPE_CHECKING:
     from consistency.bench.store.results import Tables
-    from consistency.referee.verdicts.baselines import Baseline
+    from consistency.referee.verdicts.compare_sources import Baseline
     from consistency.referee.verdicts.judge_sources import Source
 
 
@@ -189,7 +189,7 @@ def assert_program_consistent(
         The program does not exist, all of its first runs failed alike, or its tables cannot be read.
     """
     __tracebackhide__ = True
-    from consistency.referee.programs.from_python import record_of_program
+    from consistency.referee.programs.study import record_of_program
 
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     settings = _settings(demand.planned, demand)
@@ -373,7 +373,7 @@ def _source(results: Any) -> Source:
 
 def _baseline(reference: Tables | Baseline | str | Path | None, skip: int | str | None) -> Baseline | None:
     """Reference of a comparison: a baseline, its file, or results of the bench in memory or in a folder."""
-    from consistency.referee.verdicts.baselines import Baseline, baseline, read_baseline
+    from consistency.referee.verdicts.compare_sources import Baseline, baseline, read_baseline
 
     if reference is None or isinstance(reference, Baseline):
         return reference

@@ -3,7 +3,6 @@
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.bench.tuning.tune import tune
-    from consistency.bench.tuning.tuning_result import Factor, Setting, Tuning
+    from consistency.bench.tuning.tune import Factor, Setting, Tuning, tune
 
 __all__ = ["Factor", "Setting", "Tuning", "tune"]

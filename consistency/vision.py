@@ -6,24 +6,26 @@ Only :func:`relative_motion` and what else works on images needs OpenCV, the ext
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.stereo.visual_odometry.cameras.input_errors import (
+    from consistency.stereo.visual_odometry.arrays import (
         ConsensusError,
         ConvergenceError,
         DegenerateError,
         GimbalLockError,
         PointError,
     )
-    from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
-    from consistency.stereo.visual_odometry.covariance_propagation import (
+    from consistency.stereo.visual_odometry.maximum_likelihood import (
+        Refined,
         implicit_covariance,
+        refine_reprojection,
+        register_weighted,
         registration_covariance,
         triangulation_covariance,
     )
-    from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection, register_weighted
     from consistency.stereo.visual_odometry.odometry import trajectory
     from consistency.stereo.visual_odometry.registration import register_horn, register_ransac, register_svd
     from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, relative_motion
     from consistency.stereo.visual_odometry.relative_pose import RelativePose, compose, invert
+    from consistency.stereo.visual_odometry.rig import StereoRig, triangulable, triangulate
     from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
     from consistency.stereo.visual_odometry.shared import SharedError, fit_shared, sensitivities
 

@@ -11,8 +11,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script
-from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs, wins
+from consistency.bench.runs.results_to_records import mean_nees_of_runs, record_of, wins
 from consistency.referee.types import Array
 
 FINDINGS = ("fig11b", "fig13a", "fig13b", "fig13b-xyz", "consistent-stereo")

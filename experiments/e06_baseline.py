@@ -8,7 +8,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs, wins
+from consistency.bench.runs.results_to_records import mean_nees_of_runs, wins
 from consistency.bench.scenario import UvdSensor
 
 FINDINGS = ("baseline-reduces-nonlinearity", "resolution-improves-consistency")

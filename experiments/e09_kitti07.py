@@ -23,17 +23,17 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.models import point, stereo
+from consistency.bench.models import observation
 from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
+from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.recorded_log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.diagnostics import anees_interval, chi2_mean_interval
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import coverage
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.diagnostics.statistics.nees import coverage
+from consistency.referee.system.folders import manifest_of
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -104,10 +104,10 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
     pose = path[trial.step]
     _, born = np.unique(trial.landmark, return_index=True)
     (u, v, d), (x, y, heading) = trial.z[born].T, pose[born].T
-    seen = point.from_sensor(*stereo.triangulate(u, v, d, sensor.f, sensor.B), mount)
-    place = np.column_stack(point.to_world(x, y, heading, *seen))[trial.landmark]
-    back = point.to_sensor(*point.to_robot(*pose.T, *place.T), mount)
-    z = np.column_stack(stereo.project(*back, sensor.f, sensor.B)) + rng.normal(size=trial.z.shape) * sensor.sigma
+    seen = observation.from_sensor(*observation.triangulate(u, v, d, sensor.f, sensor.B), mount)
+    place = np.column_stack(observation.to_world(x, y, heading, *seen))[trial.landmark]
+    back = observation.to_sensor(*observation.to_robot(*pose.T, *place.T), mount)
+    z = np.column_stack(observation.project(*back, sensor.f, sensor.B)) + rng.normal(size=trial.z.shape) * sensor.sigma
     noise = rng.normal(size=exact.shape) * [0.0, belief.motion.sigma_v, belief.motion.sigma_omega]
     return replace(trial, controls=exact + noise, z=z, truth=path)
 

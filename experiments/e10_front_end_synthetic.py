@@ -15,8 +15,7 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import OURS, script
+from consistency.bench.runs.reproduce_findings import OURS, script, sibling
 from consistency.diagnostics import chi2_mean_interval
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.registration import rigid_motions

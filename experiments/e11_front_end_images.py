@@ -17,11 +17,10 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import command_line, sibling
-from consistency.bench.runs.reproduce_findings import OURS
+from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
 from consistency.diagnostics import Record, Verdict, judge
 from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.stopping import write_whole
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.resection import diagonal_covariances

@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import OURS, script
+from consistency.bench.runs.reproduce_findings import OURS, script, sibling
 from consistency.diagnostics import Record, Settings, detectable_ratio, judge
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure

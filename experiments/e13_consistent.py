@@ -13,10 +13,8 @@ import consistency as cs
 from consistency.bench.filters.methods.robocentric import compiled
 from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import script
-from consistency.bench.runs.results_to_records import record_of
-from consistency.bench.runs.scores_by_run import log_rmse
+from consistency.bench.runs.reproduce_findings import script, sibling
+from consistency.bench.runs.results_to_records import log_rmse, record_of
 from consistency.bench.scenario import UniformLandmarks
 from consistency.referee.system.progress import each
 

@@ -19,11 +19,11 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import command_line, sibling
 from consistency.bench.runs.montecarlo import run_log
+from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.recorded_log import Log, write_log
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.folders import manifest_of
 
 if TYPE_CHECKING:
     import mrclam_log as conversion

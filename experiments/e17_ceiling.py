@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import script
+from consistency.bench.runs.reproduce_findings import script, sibling
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 

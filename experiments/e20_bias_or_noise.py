@@ -14,8 +14,8 @@ from scipy.stats import bootstrap
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs
-from consistency.bench.scenario.effects.distortion import Distortion
+from consistency.bench.runs.results_to_records import mean_nees_of_runs
+from consistency.bench.scenario.effects import Distortion
 from consistency.referee.types import Array
 
 FINDINGS = ("bias-or-noise", "bias-survivors")

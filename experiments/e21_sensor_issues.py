@@ -11,7 +11,7 @@ from scipy.stats import ttest_rel
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script
-from consistency.bench.runs.scores_by_run import log_rmse
+from consistency.bench.runs.results_to_records import log_rmse
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
 

@@ -12,17 +12,14 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import script
+from consistency.bench.runs.reproduce_findings import script, sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Tracks
-from consistency.stereo.rendered_images.sensor_tables import track_means
+from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Stops, Tracks, stand, track_means
+from consistency.stereo.rendered_images.scene import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.stages import LeftRightCheck
-from consistency.stereo.rendered_images.stops import Stops, stand
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.arrays import opencv
 
 drives = sibling(__file__, "image_drives")
 

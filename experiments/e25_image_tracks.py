@@ -15,13 +15,23 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
-from consistency.bench.runs.reproduce_findings import OURS, script
+from consistency.bench.runs.reproduce_findings import OURS, script, sibling
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-from consistency.stereo.rendered_images.chain import DRIFTED, JUNCTION, POINT, Chain, Tracks, at_junction, join_tracks
+from consistency.stereo.rendered_images.chain import (
+    DRIFTED,
+    JUNCTION,
+    POINT,
+    Chain,
+    Stops,
+    Tracks,
+    at_junction,
+    join_tracks,
+    pose_at,
+    stand,
+)
+from consistency.stereo.rendered_images.scene import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.stages import (
     KnownDisparity,
     KnownProjection,
@@ -29,8 +39,7 @@ from consistency.stereo.rendered_images.stages import (
     Spread,
     TrackResidual,
 )
-from consistency.stereo.rendered_images.stops import Stops, pose_at, stand
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.arrays import opencv
 
 drives = sibling(__file__, "image_drives")
 

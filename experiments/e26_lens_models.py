@@ -20,16 +20,15 @@ from scipy.stats import ttest_rel
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs
+from consistency.bench.runs.results_to_records import mean_nees_of_runs
 from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.characterising.bias_map import GRID
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
-from consistency.stereo.characterising.characterise import Characterisation
+from consistency.stereo.characterising.characterise import GRID, Characterisation
 from consistency.stereo.characterising.sensor_text import believed_sensor
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.arrays import opencv
 
 FINDINGS = ("chessboard-map", "chessboard-noise")
 LONG = True

@@ -21,11 +21,10 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import command_line, sibling
-from consistency.bench.runs.reproduce_findings import OURS
+from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
 from consistency.referee.system.progress import each
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv
+from consistency.stereo.visual_odometry.arrays import ConsensusError, opencv
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, estimate_motion
 from consistency.vision import RelativePose, StereoRig, triangulate
 

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.types import Array
 from consistency.stereo.frontend.camera_truth import read_truth
-from consistency.stereo.frontend.planar_log import relative
-from consistency.stereo.visual_odometry.cameras.calibration_files import read_opencv
+from consistency.stereo.frontend.images_to_log import relative
+from consistency.stereo.visual_odometry.calibration_files import read_opencv
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import angular

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency.referee.document.colours import COLOURS, DASHES, TRUTH, Look
-from consistency.referee.show.matplotlib_style import WIDTH, canvas, dots, path, points
-from consistency.referee.show.svg import png
+from consistency.referee.document.blocks import COLOURS, DASHES, TRUTH, Look
+from consistency.referee.show.figures import WIDTH, canvas, dots, path, png, points
 from consistency.referee.types import Array
 
 FEATURES = 3.0  # standard deviations of the ellipses, fig. 2.4

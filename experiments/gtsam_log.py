@@ -18,22 +18,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.runs.experiment_scripts import command_line, sibling
+from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import require_free
-from consistency.referee.system.provenance import manifest_of
+from consistency.referee.system.folders import manifest_of, require_free
 from consistency.referee.types import Array
-from consistency.stereo.frontend.images_to_log import trajectory_text
-from consistency.stereo.frontend.planar_log import (
+from consistency.stereo.frontend.images_to_log import (
     CAMERA,
     in_robot_axes,
     planar_motions,
     planar_path,
     relative,
     robot_axes,
+    trajectory_text,
 )
 from consistency.stereo.visual_odometry.sequence import read_number_table
 

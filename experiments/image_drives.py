@@ -7,11 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from consistency.referee.types import Array
-from consistency.stereo.rendered_images.camera import StereoCamera
-from consistency.stereo.rendered_images.chain import Chain, Tracks
-from consistency.stereo.rendered_images.render import film
-from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
-from consistency.stereo.rendered_images.stops import Stops, pose_at, wall_texture
+from consistency.stereo.rendered_images.chain import Chain, Stops, Tracks, pose_at, wall_texture
+from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene, StereoCamera, film
 
 
 def retreat(chain: Chain, camera: StereoCamera, stops: Stops, rng: np.random.Generator, shake: float = 0.0) -> Tracks:

@@ -19,7 +19,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.parsing import reading
 from consistency.referee.types import Array
-from consistency.stereo.frontend.planar_log import CAMERA
+from consistency.stereo.frontend.images_to_log import CAMERA
 from consistency.stereo.visual_odometry import tracks
 from consistency.stereo.visual_odometry.common_motion import screened
 from consistency.stereo.visual_odometry.sequence import read_number_table

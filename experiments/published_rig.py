@@ -9,8 +9,8 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
+from consistency.stereo.visual_odometry.rig import StereoRig
 
 TRANSLATION, ANGLES = np.array([0.385, 0.007, 0.0]), (0.040, 0.016, 0.014)  # printed; m and rad, of the right camera
 FOCAL, SIZE = 500.0, (640, 480)  # px: a field of view of 65 degrees

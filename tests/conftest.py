@@ -9,7 +9,7 @@ from hypothesis import settings
 import consistency as cs
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import jit
-from consistency.bench.runs.trial_work import TrialWork
+from consistency.bench.runs.run_outcome import TrialWork
 
 gc.set_threshold(100_000, 20, 100)  # what is collected lives to the end
 pytest_plugins = ["pytester"]  # runs of pytest inside tests, for the plugin

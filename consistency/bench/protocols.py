@@ -44,7 +44,7 @@ class Filter(Protocol):
     filter is right; they are then judged, and otherwise only reported.
 
     ``pose`` gives the covariance of the additive error in the world. A filter with another error declares it in an
-    attribute ``error``, one of ``PLANAR`` in ``consistency.referee.geometry.conventions``, and gives the covariance of
+    attribute ``error``, one of ``PLANAR`` in ``consistency.referee.geometry``, and gives the covariance of
     that error by ``own_covariance(state)``, (3, 3). It is then judged in its own error.
 
     An attribute ``realisable = False`` marks a bound: a filter that is told the truth (``Problem.truth``) and so runs

@@ -84,8 +84,8 @@ def fit_covariance_command(
     from dataclasses import replace
 
     from consistency.referee.fit_covariance.drives import read_drives
-    from consistency.referee.fit_covariance.model_text import noise_document
     from consistency.referee.fit_covariance.noise_model import fit_covariance as fit
+    from consistency.referee.fit_covariance.noise_model import noise_document
     from consistency.referee.system.folders import require_free
 
     require_word("--fail-on", fail_on, "inconsistent")
@@ -101,7 +101,7 @@ def fit_covariance_command(
     )  # fmt: skip
     written: list[Path] = []
     if out is not None:
-        from consistency.referee.fit_covariance.writing import write_model
+        from consistency.referee.fit_covariance.fit_files import write_model
 
         written = write_model(model, out, overwrite)
     if no_correct:
@@ -149,8 +149,7 @@ def correct_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
     """Find factors for a stated covariance. Judge them on runs that chose nothing."""
-    from consistency.referee.fit_covariance.correct import correct, the_record
-    from consistency.referee.fit_covariance.correction_text import correction_document
+    from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.system.folders import require_free
     from consistency.referee.verdicts.judge_sources import skip_asked
@@ -173,7 +172,7 @@ def correct_command(
     written: list[Path] = []
     is_written = out is not None and (anyway or found.status != "inconsistent")
     if out is not None and is_written:
-        from consistency.referee.fit_covariance.correction_files import write_correction
+        from consistency.referee.fit_covariance.fit_files import write_correction
 
         written = write_correction(found, record, texts, out, overwrite)
     print_document(correction_document(found), as_json, written)

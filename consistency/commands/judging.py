@@ -1,9 +1,13 @@
-"""Verdicts: ``analyse``, ``report`` and ``plan``; they parse, call and print."""
+"""Verdicts: ``analyse``, ``report``, ``plan``, ``compare``, ``baseline`` and ``monitor``.
+
+They parse, call and print.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,16 +30,20 @@ from consistency.commands.shared_options import (
     reads_files,
     require_word,
     require_written,
+    tell,
     tell_notes,
 )
 from consistency.referee.column_names import POSE
-from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
+from consistency.referee.defaults import DETECT, FALSE_ALARM, GATE_FALSE_ALARM, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.records.record import Skip as FirstSteps
+    from consistency.referee.readers.formats.innovation_files import NisLog
+    from consistency.referee.verdicts.compare_sources import Baseline
     from consistency.referee.verdicts.judge_sources import Source
 
 
@@ -91,7 +99,7 @@ def analyse_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files other than reports, too.")] = False,
 ) -> None:
     """Check whether stated covariances match the errors. Explain the verdict."""
-    from consistency.referee.document.judged_filters import document
+    from consistency.referee.document.tables import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.judge_sources import files_source, judge_all, settings_of, skip_asked
 
@@ -231,9 +239,9 @@ def plan_command(
     as_json: AsJson = False,
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
-    from consistency.referee.document.needed_runs import plan_lines
-    from consistency.referee.verdicts.planned_runs import pilots_of_records
-    from consistency.referee.verdicts.planned_runs import plan as plan_runs
+    from consistency.referee.document.tables import plan_lines
+    from consistency.referee.verdicts.judge_sources import pilots_of_records
+    from consistency.referee.verdicts.judge_sources import plan as plan_runs
 
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
@@ -265,3 +273,210 @@ def plan_command(
         print(json.dumps(planned, indent=2))
     else:
         print("\n".join(plan_lines(planned)))
+
+
+@reads_files(without=GROUPED)
+def compare_command(
+    path: Judged,
+    files: Reading,
+    other: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="Earlier files in the same form, or a file of 'baseline'.")
+    ] = None,
+    filters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="Filters to compare, the first with the rest; with OTHER, the filter to use in both.",
+        ),
+    ] = None,
+    false_alarm: FalseAlarm = FALSE_ALARM,
+    skip: Skip = None,
+    as_json: AsJson = False,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'worse': exit with status 1 if the first is worse.")
+    ] = None,
+) -> None:
+    """Compare a filter with another, or with an earlier version. On the same trials, the comparison is run by run."""
+    from consistency.referee.verdicts.compare_sources import (
+        compare_filters,
+        compare_with,
+        comparison_document,
+        is_baseline,
+    )
+    from consistency.referee.verdicts.judge_sources import skip_asked
+
+    require_word("--fail-on", fail_on, "worse")
+    if not 0.0 < false_alarm < 1.0:
+        raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
+    first = skip_asked(skip)
+    sides = [each for each in (path, other) if each is not None]
+    estimates = [each for each in sides if not is_baseline(each) and are_files(each, files)]
+    if not estimates and (unread := files.given()):
+        raise InputError(f"{flag_of(unread[0])}: is for files of another estimator, and none is named")
+    if len(estimates) == 2 and files.covariance is not None:
+        raise InputError(
+            f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
+        )
+    read = {each: read_files(each, files) for each in estimates}
+    new, *old = (_summaries(each, read.get(each), first, files.truth) for each in sides)
+    if old:
+        compared = compare_with(new, old[0], filters or [], false_alarm)
+    else:
+        compared = compare_filters(new, filters or [], false_alarm)
+    tell_notes(*read.values())
+    print_document(comparison_document(compared), as_json)
+    if fail_on and any(each.worse for each in compared):
+        raise typer.Exit(1)
+
+
+def _summaries(path: Path, recordings: list[Record] | None, first: FirstSteps | None, truth: Path | None) -> Baseline:
+    """Return a row for each run of estimates, of a folder of results, or of a file of 'baseline'."""
+    from consistency.referee.verdicts.compare_sources import baseline, read_baseline
+
+    if recordings is not None:
+        return baseline(recordings, str(path), first, truth)
+    if path.is_dir():
+        from consistency.bench.runs.results_to_records import results_source
+
+        return baseline(results_source(path), str(path), first)
+    return read_baseline(path, first)
+
+
+@reads_files(without=GROUPED)
+def baseline_command(
+    path: Judged,
+    out: Annotated[Path, typer.Option("--out", help="JSON file to write; small enough for version control.")],
+    files: Reading,
+    skip: Skip = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")] = False,
+) -> None:
+    """Store what a later 'compare' needs, one row a run."""
+    from consistency.referee.verdicts.compare_sources import baseline as summarise
+    from consistency.referee.verdicts.compare_sources import write_baseline
+
+    recordings: list[Record] = []
+    source: Source | list[Record]
+    if are_files(path, files):
+        source = recordings = read_files(path, files)
+    else:
+        from consistency.bench.runs.results_to_records import results_source
+
+        source = results_source(path)
+    write_baseline(summarise(source, str(path), skip, files.truth), out, overwrite)
+    tell_notes(recordings)
+    print(f"baseline in {out}; next: consistency compare NEW {out}")
+
+
+@reads_files(only=("columns", "dof"))
+def monitor_command(
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="Innovations of one run: .csv, .parquet, .npz, .ulg of PX4, .bin of ArduPilot, a folder of 'run', "
+            "or - for CSV lines.",
+        ),
+    ],
+    files: Reading,
+    innovations: Annotated[
+        str | None,
+        typer.Option("--innovations", help="'optimal': declare the optimal gain, without which nothing is judged."),
+    ] = None,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Probability that a correct filter ever raises an alarm.")
+    ] = GATE_FALSE_ALARM,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Accept scales of the NIS up to this ratio; 1 is the exact test.")
+    ] = 1.2,
+    gate: Annotated[
+        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+    ] = None,
+    mission: Annotated[
+        int | None, typer.Option("--mission", help="Number of innovations of the whole mission, if known.")
+    ] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Filter to use if FILE holds several; for flight logs, the sensor.")
+    ] = None,
+    run: Annotated[
+        int | None,
+        typer.Option("--run", help="Run to use if FILE holds several; for flight logs, the instance of the EKF."),
+    ] = None,
+    skip: Skip = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Plot of NIS and evidence, .png, .pdf or .svg.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing plot.")] = False,
+    as_json: AsJson = False,
+    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit with status 1 on an alarm.")] = None,
+) -> None:
+    """Watch the innovations of a deployed filter. Raise an alarm if their size is not what the filter states."""
+    from consistency.referee.document.alarms import monitor_document
+    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.readers.formats.flight_logs import STATED, is_dataflash
+    from consistency.referee.verdicts.judge_sources import skip_asked
+    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines, without_first
+
+    require_word("--fail-on", fail_on, "alarm")
+    first = skip_asked(skip)
+    if is_dataflash(Path(path)) and filter_name not in STATED:
+        if refused := given_options(fail_on=fail_on, gate=gate, mission=mission, skip=skip):
+            option = next(iter(refused)).replace("_", "-")
+            raise InputError(f"--{option}: {path} holds test ratios, of which nothing is judged, unless --filter names "
+                             f"{' or '.join(STATED)}")  # fmt: skip
+        _show_ratios(Path(path), filter_name, run, plot, overwrite, as_json)
+        return
+    watcher = make_monitor(innovations, false_alarm=false_alarm, tolerance=tolerance, gate=gate, mission=mission)
+    if path == "-":
+        options = given_options(filter=filter_name, run=run, skip=skip, plot=plot)
+        if options:
+            raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
+        watched = watch_lines(sys.stdin, "stdin", watcher, partial(print, file=sys.stderr, flush=True), files)
+    else:
+        log = without_first(_read_innovations(Path(path), filter_name, run, files), first)
+        tell(log.notes)
+        if plot is not None:
+            require_plot(plot, overwrite)
+        watched = watch(log, watcher)
+    print_document(
+        monitor_document(
+            watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t, min(watched.t, default=0.0)
+        ),
+        as_json,
+    )
+    if plot is not None:
+        from consistency.referee.pages.record_figures import monitor_drawing
+
+        plotted(partial(monitor_drawing, watched), plot)
+    if fail_on and watched.alarm is not None:
+        raise typer.Exit(1)
+
+
+def _read_innovations(path: Path, filter_name: str | None, run: int | None, files: Reading) -> NisLog:
+    """Return the innovations of one run in a file, or in a folder of results."""
+    if path.is_dir():
+        from consistency.bench.runs.results_to_records import innovations_of
+        from consistency.referee.readers.formats.innovation_files import refuse_options
+
+        refuse_options(path, files)
+        return innovations_of(path, filter_name, run)
+    from consistency.referee.verdicts.monitor_sources import read_innovations
+
+    return read_innovations(path, filter_name, run, files)
+
+
+def _show_ratios(
+    path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
+) -> None:
+    """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
+    from consistency.referee.document.alarms import ratios_document
+    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.readers.formats.flight_logs import read_ratios
+
+    if plot is not None:
+        require_plot(plot, overwrite)
+    ratios, notes = read_ratios(path, sensor, core)
+    tell(notes)
+    print_document(ratios_document(path.stem, ratios), as_json)
+    if plot is not None:
+        from consistency.referee.pages.record_figures import monitor_drawing
+
+        plotted(partial(monitor_drawing, ratios), plot)

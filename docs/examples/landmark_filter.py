@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 
 LAG = 0.2  # s, of the robots behind their odometry
 WHEELS = 0.05, 0.1  # m/s, rad/s, in each message of the odometry

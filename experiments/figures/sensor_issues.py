@@ -23,9 +23,8 @@ from consistency.bench.pages.sections.published_findings import (
     single,
 )
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import Block, Figure, Table
-from consistency.referee.document.colours import COLOURS, EXPECTED, Look, style
-from consistency.referee.show.matplotlib_style import curve, edges, log_axis, stroke
+from consistency.referee.document.blocks import COLOURS, EXPECTED, Block, Figure, Look, Table, style
+from consistency.referee.show.figures import curve, edges, log_axis, stroke
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,13 +10,12 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.models.stereo import project, triangulate_jacobian
+from consistency.bench.models.observation import project, triangulate_jacobian
 from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.types import Gaussian
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import Look, style
-from consistency.referee.show.matplotlib_style import add_legend, canvas, path, points, stroke
+from consistency.referee.document.blocks import Figure, Look, style
+from consistency.referee.show.figures import add_legend, canvas, path, points, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

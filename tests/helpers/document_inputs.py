@@ -325,7 +325,7 @@ def names_of(page, folder):
     world = cs.load_scenario("herath2007-stereo").variant("short", truth__steps=40)
     if page == "docs/gates.md":
         from consistency.bench.runs.results_to_records import results_source
-        from consistency.referee.verdicts.baselines import baseline, write_baseline
+        from consistency.referee.verdicts.compare_sources import baseline, write_baseline
         from consistency.testing import assert_not_worse
 
         done = cs.run_trials(world, ["ekf-uvd", "ekf-xyz"], runs=60, seed=5, jobs=1)

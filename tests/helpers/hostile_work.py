@@ -14,9 +14,8 @@ from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.simulation import World
 from consistency.bench.store.results import open_results
 from consistency.bench.sweeps.regime_map import read_regime, regime_of, write_regime
-from consistency.bench.sweeps.run_cell import CellOutcome, CellResult, runs_table
+from consistency.bench.sweeps.run_sweep import CellOutcome, CellResult, CellWork, SweepFolder, runs_table
 from consistency.bench.sweeps.sweep_file import load_sweep
-from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder
 
 STUDY, RUNS = ("--filter", "kf", "--jobs", "1", "--seed", "4"), 4
 SIZE = (160, 120)  # px

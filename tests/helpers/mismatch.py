@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from consistency.bench.scenario.effects.effect import ListedEffect
+from consistency.bench.scenario.observations import ListedEffect
 
 RATE = 0.05
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.patches import PathPatch
 
 from consistency.referee.document.blocks import Document, Figure
-from consistency.referee.show.svg import drawn
+from consistency.referee.show.figures import drawn
 
 
 def panels(figure, number=0):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from consistency.bench.runs.experiment_scripts import figure_scripts, sibling
+from consistency.bench.runs.reproduce_findings import figure_scripts, sibling
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 

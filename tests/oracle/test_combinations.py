@@ -20,15 +20,16 @@ from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.filter_declarations import problem_for
 from consistency.bench.filters.kernel.part_functions import (
     State,
+    Unicycle,
     insert_error,
     landmark_width,
+    move,
     observed_width,
     place,
     propagate,
     retract,
     stands_apart,
 )
-from consistency.bench.filters.kernel.unicycle import Unicycle, move
 from consistency.bench.filters.kernel.update_steps import linearise_seen, make_work
 from consistency.bench.filters.methods.ideal import AtTruth
 from consistency.bench.filters.run_filter import step_through

@@ -16,15 +16,24 @@ from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, usable_na
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, heading_matrix
-from consistency.bench.models import motion, point, stereo
+from consistency.bench.models import motion
+from consistency.bench.models import observation as point
+from consistency.bench.models import observation as stereo
 from consistency.bench.protocols import Problem
 from consistency.referee.types import Array
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
 
-from consistency.bench.filters.external import gtsam_factors  # noqa: E402
-from consistency.bench.filters.external.gtsam import FixedLag, Incremental, WholeTrialSmoother  # noqa: E402
-from consistency.bench.filters.external.gtsam_factors import PlanarStereo, custom_factor, landmark_key, pose_key  # noqa: E402
+from consistency.bench.filters.external import gtsam as gtsam_factors  # noqa: E402
+from consistency.bench.filters.external.gtsam import (  # noqa: E402  # noqa: E402
+    FixedLag,
+    Incremental,
+    PlanarStereo,
+    WholeTrialSmoother,
+    custom_factor,
+    landmark_key,
+    pose_key,
+)
 
 NAMES = ("gtsam-batch-uvd", "gtsam-lag-uvd", "gtsam-map-uvd")
 

@@ -5,14 +5,17 @@ import pytest
 from hyperdual import HyperDual, derivatives
 
 from consistency.referee.geometry import rotation
-from consistency.stereo.visual_odometry.cameras.rig import solved
-from consistency.stereo.visual_odometry.covariance_propagation import (
+from consistency.stereo.visual_odometry.maximum_likelihood import (
+    PixelMatches,
+    PointMatches,
+    TwoFrames,
+    _profile,
+    loss,
     registration_derivatives,
     triangulation_derivatives,
 )
-from consistency.stereo.visual_odometry.maximum_likelihood import _profile, loss
-from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches, PointMatches, TwoFrames
-from consistency.stereo.visual_odometry.two_frame_cost import cost_derivatives as two_frame_derivatives
+from consistency.stereo.visual_odometry.maximum_likelihood import cost_derivatives as two_frame_derivatives
+from consistency.stereo.visual_odometry.rig import solved
 from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
 
 TOLERANCE = 1e-8  # of the largest entry

@@ -9,15 +9,13 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.errors import InputError
-from consistency.referee.geometry import wrap
-from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.lie_groups import se3_log, spatial_error
+from consistency.referee.geometry import SPATIAL, se3_log, spatial_error, wrap
 from consistency.referee.readers.formats.sheet import read_sheet
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.readers.truth_matching import BRIDGED, truth_at
-from consistency.referee.verdicts.baselines import _known
+from consistency.referee.verdicts.compare_sources import _known
 
 
 def test_a_table_has_the_errors_that_were_written(tmp_path):

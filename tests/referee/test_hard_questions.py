@@ -8,9 +8,9 @@ import pytest
 from scipy import integrate, special, stats
 
 from consistency.diagnostics import hotelling, mean_shape, nis_whiteness, simultaneous_band, whiteness
-from consistency.referee.diagnostics.questions.innovations import cube_root_moments
+from consistency.referee.diagnostics.questions.bias_and_shape import products_test
 from consistency.referee.diagnostics.questions.scale import _log_nu_of_means
-from consistency.referee.diagnostics.questions.shape import products_test
+from consistency.referee.diagnostics.questions.whiteness import cube_root_moments
 from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
 
 RATE = 1e-5

@@ -8,9 +8,9 @@ import forks
 COMPILING = 300.0  # s, of a command that may compile
 IMPORTS = """
 import consistency as cs
-import consistency.commands, consistency.referee.show.as_html, consistency.referee.show.svg
+import consistency.commands, consistency.referee.show.as_html, consistency.referee.show.figures
 import consistency.referee.show.pdf, consistency.referee.verdicts.compare_sources
-import consistency.bench.runs.run_until_decided, consistency.bench.sweeps.run_sweep
+import consistency.bench.runs.montecarlo, consistency.bench.sweeps.run_sweep
 
 cs.get_filter("ekf-uvd")
 cs.analyse(cs.run_trials(cs.load_scenario("linear-gaussian").variant("short", truth__steps=8), ["kf"], 20, jobs=1))

@@ -14,9 +14,8 @@ from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.scenario import Belief, PicturedSensor, read_table
 from consistency.bench.store.recorded_log import SensorFile, read_log
 from consistency.commands.app import main
-from consistency.stereo.characterising.characterise import characterise
+from consistency.stereo.characterising.characterise import Residuals, characterise
 from consistency.stereo.characterising.sensor_text import believed_sensor, measured_sensor_toml
-from consistency.stereo.characterising.truth_residuals import Residuals
 
 
 def run(*arguments):

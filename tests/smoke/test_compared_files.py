@@ -9,7 +9,7 @@ from own_process import consistency
 from recorded import read_recordings
 
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.baselines import baseline
+from consistency.referee.verdicts.compare_sources import baseline
 
 OPTIONS = ("--truth", "truth.csv", "--state", "a,b")
 RUNS, STEPS = 24, 15

@@ -21,8 +21,8 @@ from consistency.commands import main
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.document.alarms import monitor_document
 from consistency.referee.document.blocks import Chapter, Document, Figure
-from consistency.referee.pages.nis_over_time import monitor_drawing
-from consistency.referee.pages.questions_table import MARKS
+from consistency.referee.pages.record_figures import monitor_drawing
+from consistency.referee.pages.verdicts import MARKS
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show import as_html
 from consistency.referee.verdicts.monitor_sources import make_monitor, watch

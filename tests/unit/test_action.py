@@ -20,7 +20,7 @@ import typer
 from documents import ROOT
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 from consistency.commands.app import app
 
 pytest.importorskip("yaml", reason="PyYAML (the extra vision) is not installed")

@@ -54,7 +54,7 @@ def test_the_command_of_the_document_works(copy):
     assert row.count("\n") == 1
     (copy / "consistency/commands/worst.py").write_text(module, encoding="utf-8")
     first = "    # the laboratory\n"
-    changed(copy / "consistency/commands/registry.py", first, f"{row.rstrip()},\n{first}")
+    changed(copy / "consistency/commands/app.py", first, f"{row.rstrip()},\n{first}")
     told = python(
         copy,
         "import sys\nfrom consistency.commands import main\n"
@@ -89,7 +89,7 @@ def test_the_question_of_the_document_is_asked(copy):
     changed(
         tests, "from consistency.referee.diagnostics.records.whitening",
         "from consistency.referee.diagnostics.questions.trend import trend\n"
-        "from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE, SHARES\n"
+        "from consistency.referee.diagnostics.verdict.parts import ABOUT, ALONE, SHARES\n"
         "from consistency.referee.diagnostics.records.whitening",
     )  # fmt: skip
     done = python(
@@ -125,7 +125,7 @@ def test_the_renderer_of_the_document_works(copy):
     heads, cells, *_ = (copy / "out.csv").read_text().splitlines()
     assert heads == "filter,verdict,ANEES,true / stated,RMSE m,RMSE deg,NIS/dof,failed"
     assert cells.startswith("est,overconfident,29.00,")
-    imports = "from pathlib import Path\nfrom consistency.referee.gating.session_ledger import path_fault"
+    imports = "from pathlib import Path\nfrom consistency.referee.gating.session import path_fault"
     refusal = f"{imports}\nprint(path_fault(Path('a.b')))"
     assert ".csv" in python(copy, refusal).stdout
 
@@ -164,7 +164,7 @@ def test_the_bias_of_the_document_works(copy):
     effect, test, (line, key) = example("bias.py"), example("check_bias.py"), code("Add a sensor effect")
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
-    names, first = copy / EFFECTS / "__init__.py", "from consistency.bench.scenario.effects.effect"
+    names, first = copy / EFFECTS / "__init__.py", "from consistency.bench.scenario.observations"
     changed(names, first, line + first)
     scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
     (copy / "mine.toml").write_text(f"{scenario}\n{key}", encoding="utf-8")

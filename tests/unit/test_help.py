@@ -8,8 +8,7 @@ import typer
 from command import consistency
 from documents import ROOT
 
-from consistency.commands.app import app
-from consistency.commands.registry import COMMANDS, GROUPS, PANELS
+from consistency.commands.app import COMMANDS, GROUPS, PANELS, app
 
 PANELLED = ("analyse", "report", "compare", "baseline")
 VERBS = [

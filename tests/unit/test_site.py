@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import consistency
 from consistency import diagnostics, testing, vision
-from consistency.commands.registry import COMMANDS
+from consistency.commands.app import COMMANDS
 
 DOCS = Path(__file__).parents[2] / "docs"
 

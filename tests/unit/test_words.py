@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from consistency.diagnostics import Interval, Record, Settings, judge
-from consistency.referee.diagnostics.questions.outliers import outliers
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.questions.tails import outliers
 from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.verdict.verdict import plain
 from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
-from consistency.referee.document.blocks import Reasons
-from consistency.referee.document.judged_filters import reason
-from consistency.referee.document.wording import fragment
+from consistency.referee.document.blocks import Reasons, fragment
+from consistency.referee.document.tables import reason
 from consistency.referee.types import Failure
 
 SURE = 1e-5

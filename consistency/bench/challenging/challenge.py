@@ -1,37 +1,53 @@
-"""Search and confirm on fresh trials: the world in which a filter is most overconfident."""
+"""The world in which a filter is most overconfident: a search over scores of trials, and one test on fresh trials.
+
+Points come in batches. The first batch, and a quarter of each later one, fills the unit cube evenly (Halton's
+sequence); the rest varies the best points so far by differential mutation and crossover (Storn & Price 1997). A batch
+is raced by successive halving (Jamieson & Talwalkar 2016): two trials for each point, twice as many for the better
+half, and so on. Awad, Mallik & Hutter (2021) combine the two likewise. Mixed dimensions need nothing of their own: all
+are places in the unit cube.
+
+The sampler is SciPy's. Its optimisers know neither noise nor evaluations that are broken off, and Hypothesis'
+``target`` has no time limit.
+"""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import qmc
 
-from consistency.bench.challenging.world_scores import ChallengeScorer
 from consistency.bench.challenging.world_space import Point, Space, require_right_belief, space_of
-from consistency.bench.challenging.worst_point_search import RUNGS, Budget, ScoredWorld, ranked, search
 from consistency.bench.filters import get_filter
+from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.filter_declarations import name_of
-from consistency.bench.filters.resolve_filters import resolve_filters
+from consistency.bench.filters.run_filter import resolve_filters
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.analyse_results import analyse
+from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
+from consistency.bench.runs.results_to_records import analyse
+from consistency.bench.runs.run_outcome import compile_all, first_trials, outcome_of
+from consistency.bench.runs.workers import worker_count
 from consistency.bench.scenario import Scenario, load_scenario, scenario_text
+from consistency.bench.simulation import require_landmarks_in_view
+from consistency.bench.simulation.world import World
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.answers import JOINT, SCALE, Settings
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.verdict.parts import JOINT, SCALE, Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
 from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.errors import InputError
-from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
+from consistency.referee.system.stopping import write_whole
+from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import refused
 
 BASES = ("herath2007-stereo", "herath2007-xyz", "linear-gaussian")  # the first that a filter works on is its base
@@ -39,6 +55,16 @@ SIZE_QUESTIONS = (*SCALE, JOINT, "outliers")  # what a confirmation needs a faul
 SEARCH = 0.8  # share of the budget that is spent on the search
 CONFIRM = 0.2  # of the time, the most that the confirmation may take in a world that is searched
 EVERY = 5.0  # seconds between lines of progress
+WORST = float(np.log(1e4))  # of a run that failed, and the most of one that did not
+PATIENCE = 60.0  # s beyond the end of the search, after which a trial of a filter that is not compiled is killed
+Job = tuple[Scenario, Sequence[int]]  # a world, and the trials in it
+BATCH = 16  # points raced against each other
+RUNGS = (2, 4, 8, 16)  # trials of a point in all, at each of which the worse half is left behind
+HOPELESS = 8 * BATCH  # points none of which is usable: there will be no other
+ELITE = 8  # points that are varied
+EVEN = 4  # points of a batch that fill the space
+STEP, CROSSOVER, JITTER = 0.7, 0.5, 0.05  # of the variation; the first two within the usual ranges of the method
+LEAST_SPREAD = 0.3  # of a trial's score, where a few agree by chance
 
 
 @dataclass(frozen=True)
@@ -359,3 +385,194 @@ def write_scenario(outcome: Challenge, out: Path) -> None:
     )
     with writing(out):
         write_whole(out, text.encode("utf-8"))
+
+
+@dataclass(frozen=True)
+class Done:
+    """Scores of the trials of a world, fewer than were asked for where the time was up."""
+
+    scores: tuple[float, ...]
+    seconds: float  # of the fastest trial; others may have waited for a busy machine
+
+
+class ChallengeScorer:
+    """Scores one filter; to be used in a ``with``, which holds the workers.
+
+    The score of a trial is log(mean NEES of the run / 3), which is 0 or a little less for a right filter. The
+    logarithm keeps one diverged run among many from deciding which of two worlds is worse.
+    """
+
+    def __init__(self, filter_: Filter, jobs: int = -1) -> None:
+        self.filter, self.workers = filter_, worker_count(jobs)
+        # kernels release the GIL; other filters run in processes, for which threads wait
+        self._pool = ThreadPoolExecutor(self.workers)
+
+    def __enter__(self) -> ChallengeScorer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def compile(self, worlds: Sequence[Scenario]) -> None:
+        """Compile what the filter needs in these worlds, so that a search spends no time on it."""
+        compile_all(first_trials((self.filter, world) for world in worlds), self.workers)
+
+    def __call__(self, jobs: Sequence[Job], seed: int, until: float = np.inf) -> list[Done | None]:
+        """Scores of each job in its order; None for a world in which no landmark comes into view.
+
+        No trial begins after ``until``, a time of ``time.monotonic``.
+        """
+        with one_blas_thread():
+            return list(self._pool.map(lambda job: _score(self.filter, job, seed, until), jobs))
+
+
+def _score(filter_: Filter, job: Job, seed: int, until: float) -> Done | None:
+    scenario, runs = job
+    if time.monotonic() >= until:
+        return Done((), 0.0)
+    try:
+        world = require_landmarks_in_view(scenario)
+    except InputError:
+        return None
+    scores, fastest = [], np.inf
+    timeout = until - time.monotonic() + PATIENCE if np.isfinite(until) else None
+    with Isolation([filter_], scenario.belief, timeout) as isolation:
+        for run in runs:
+            began = time.monotonic()
+            if began >= until:
+                break
+            scores.append(score_of_run(isolation, world, run, seed))
+            fastest = min(fastest, time.monotonic() - began)
+    return Done(tuple(scores), fastest if scores else 0.0)
+
+
+def score_of_run(isolation: Isolation, world: World, run: int, seed: int) -> float:
+    """log(mean NEES / 3) of a run of the one filter, in its own error; :data:`WORST` where it failed."""
+    trial = world.trial(run, seed)
+    outcome = outcome_of(trial, isolation.run(trial))
+    if outcome.failures:
+        return WORST
+    [columns] = outcome.estimates.values()
+    nees = np.asarray(columns.get("own_nees", columns["nees"]), float)
+    nees = nees[np.isfinite(nees)]
+    if not len(nees):
+        return WORST
+    with np.errstate(divide="ignore"):
+        return float(np.clip(np.log(nees.mean() / len(POSE)), -WORST, WORST))
+
+
+@dataclass
+class ScoredWorld:
+    """A point with the scores of its trials so far."""
+
+    point: Point
+    scores: list[float] = field(default_factory=list)
+    usable: bool = True  # False where there is no such world, or it takes too long
+
+    @property
+    def score(self) -> float:
+        if not self.scores or not self.usable:
+            return -np.inf
+        return float(np.mean(self.scores)) - standard_error(self.scores)
+
+
+def standard_error(scores: Sequence[float]) -> float:
+    """Of the mean of scores; a few that agree by chance are not taken at their word."""
+    spread = float(np.std(scores, ddof=1)) if len(scores) > 1 else 0.0
+    return max(spread, LEAST_SPREAD) / float(np.sqrt(len(scores)))
+
+
+# gives each candidate scores up to a number of trials, as far as the budget goes, or marks it as not usable
+Evaluate = Callable[[Sequence[ScoredWorld], int], None]
+
+
+class Budget:
+    """Time, or a number of trials, of which shares are spent; with trials the outcome does not depend on the clock."""
+
+    def __init__(self, seconds: float | None = None, trials: int | None = None) -> None:
+        self.seconds, self.trials = seconds, trials
+        self.started, self.used = time.monotonic(), 0
+
+    @property
+    def elapsed(self) -> float:
+        return time.monotonic() - self.started
+
+    def left(self, share: float) -> bool:
+        """Is less than this share of the budget spent?"""
+        if self.trials is not None:
+            return self.used < share * self.trials
+        return self.seconds is None or self.elapsed < share * self.seconds
+
+    def until(self, share: float) -> float:
+        """The time of ``time.monotonic`` at which this share is spent; infinite with a number of trials."""
+        return np.inf if self.seconds is None else self.started + share * self.seconds
+
+
+def search(
+    space: Space,
+    evaluate: Evaluate,
+    left: Callable[[], bool],
+    rng: np.random.Generator,
+    tried: dict[Point, ScoredWorld],
+) -> None:
+    """Try batches of points, which are added to those ``tried`` before.
+
+    Parameters
+    ----------
+    evaluate : gives candidates trials
+    left : whether to continue with another batch, and another rung
+    """
+    even = qmc.Halton(len(space.dimensions), rng=rng)
+    while left():
+        batch = _batch(space, tried, even, rng)
+        if not batch:
+            break
+        tried |= {candidate.point: candidate for candidate in batch}
+        _race(batch, evaluate, left)
+        if len(tried) >= HOPELESS and not any(candidate.usable for candidate in tried.values()):
+            break
+
+
+def ranked(candidates: Iterable[ScoredWorld]) -> list[ScoredWorld]:
+    """Usable candidates, the worst first; those with the trials of the last rung before the others."""
+    usable = [c for c in candidates if c.usable and c.scores]
+    return sorted(usable, key=lambda c: (len(c.scores) >= RUNGS[-1], c.score), reverse=True)
+
+
+def _race(batch: list[ScoredWorld], evaluate: Evaluate, left: Callable[[], bool]) -> None:
+    alive = batch
+    for trials in RUNGS:
+        if not left():
+            return
+        evaluate(alive, trials)
+        alive = sorted((c for c in alive if c.usable), key=lambda c: c.score, reverse=True)
+        alive = alive[: max(1, len(alive) // 2)]
+
+
+def _batch(
+    space: Space, tried: dict[Point, ScoredWorld], even: qmc.Halton, rng: np.random.Generator
+) -> list[ScoredWorld]:
+    """New points; the first of all is that of the base."""
+    elite = sorted((c for c in tried.values() if c.usable and c.scores), key=lambda c: c.score, reverse=True)[:ELITE]
+    new_points: dict[Point, ScoredWorld] = {} if tried else {space.plain: ScoredWorld(space.plain)}
+    for _ in range(20 * BATCH):  # a small space has no more to offer
+        if len(new_points) == BATCH:
+            break
+        if len(elite) >= 4 and len(new_points) >= EVEN:
+            place = _varied(np.array([space.where(each.point) for each in elite]), rng)
+        else:
+            place = even.random()[0]
+        point = space.at(place)
+        if point not in tried and point not in new_points:
+            new_points[point] = ScoredWorld(point)
+    return list(new_points.values())
+
+
+def _varied(elite: Array, rng: np.random.Generator) -> Array:
+    """A point of the elite (n, d) with some coordinates moved along the difference of two others."""
+    base, plus, minus = rng.choice(len(elite), 3, replace=False)
+    moved = elite[base] + STEP * (elite[plus] - elite[minus]) + JITTER * rng.standard_normal(elite.shape[1])
+    is_mutated = rng.random(elite.shape[1]) < CROSSOVER
+    is_mutated |= np.arange(elite.shape[1]) == rng.integers(elite.shape[1])
+    u = np.where(is_mutated, moved, elite[base])
+    return np.asarray(1.0 - np.abs(1.0 - np.abs(u) % 2.0))  # reflected at 0 and 1

@@ -27,7 +27,7 @@ from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE
+from consistency.referee.geometry import ADDITIVE
 from consistency.referee.types import Array, Failure
 
 # models of sensors by what the name of a filter ends in
@@ -72,7 +72,7 @@ class Compiled:
     ``local_from`` is the number of variables in the state from which the kernels update locally, where the parts
     allow it; the numbers are the same. What else ``textbook`` declares is declared of this: ``innovations`` and
     ``realisable`` (:class:`consistency.bench.protocols.Filter`), ``error``
-    (:mod:`consistency.referee.geometry.conventions`), and ``needs``, the keys of ``belief.sensor`` that it cannot do
+    (:mod:`consistency.referee.geometry`), and ``needs``, the keys of ``belief.sensor`` that it cannot do
     without and others can.
     """
 

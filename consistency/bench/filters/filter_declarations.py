@@ -12,7 +12,7 @@ from consistency.bench.protocols import Filter, Problem, TrialTruth, WholeTrial
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.geometry import ADDITIVE, PLANAR
 
 FILTER = 2  # purpose in the spawn key of the seed; 0 and 1 are those of the simulation
 

@@ -1,25 +1,30 @@
-"""Any filter through a trial, step by step: the path that filters of the user's own take."""
+"""Any filter through a trial, step by step, by its name or as an object."""
 
 from __future__ import annotations
 
 import sysconfig
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from consistency.bench.filters import filter_names, get_filter, usable_names
 from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, random_numbers, rejects
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.scenario import Belief
+from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE
-from consistency.referee.parsing import one_line
+from consistency.referee.geometry import ADDITIVE
+from consistency.referee.parsing import one_line, require_name
 from consistency.referee.types import Array, Failure, Indices
+
+SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
+LONGEST = 1000  # characters of an exception's message that are kept
 
 
 @dataclass(frozen=True)
@@ -72,8 +77,6 @@ class RunRecord:
         )  # fmt: skip
 
 
-SYMMETRY = 1e-8  # relative to the largest entry, as nees() demands
-LONGEST = 1000  # characters of an exception's message that are kept
 NOT_THE_USERS = [str(Path(__file__).parents[2]), *map(sysconfig.get_path, ("stdlib", "purelib", "platlib"))]
 
 
@@ -275,3 +278,44 @@ def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:
     if array.shape != shape:
         raise ValueError(f"{method}() gave an array of shape {array.shape}, not {shape}")
     return array
+
+
+def resolve_filters(
+    filters: str | Filter | Sequence[str | Filter], belief: Belief, log: str | None = None
+) -> list[Filter]:
+    """Filters by name or as they are, checked against the sensor, of the log in a folder or of a scenario."""
+    filters = [filters] if isinstance(filters, str | Filter) else filters
+    instances = [get_filter(f) if isinstance(f, str) else f for f in filters]
+    if not instances:
+        raise InputError(f"no filter given; known: {', '.join(filter_names())}")
+    for filter_ in instances:
+        if isinstance(filter_, type) or not isinstance(filter_, Filter):
+            hint = (
+                "give an object of it, with ()" if isinstance(filter_, type) else "it needs init, predict, update, pose"
+            )
+            raise InputError(f"{filter_!r} is not a filter: {hint}")
+    names = [name_of(f) for f in instances]
+    if len(set(names)) < len(names):
+        raise InputError(f"a filter is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+    built_in = filter_names()
+    for given, name in zip(filters, names, strict=True):
+        is_ours = isinstance(given, str) or type(given).__module__.startswith("consistency.")
+        if name in built_in and not is_ours:
+            raise InputError(f"filter '{name}': is a built-in filter; give yours another name")
+    model = belief.sensor.model
+    for filter_ in instances:
+        require_name(name_of(filter_), "filter")
+        error_of(filter_)
+        sensors = getattr(filter_, "sensors", None)
+        if sensors is not None and model not in sensors:
+            fitting = [name for name in usable_names() if model in getattr(get_filter(name), "sensors", (model,))]
+            raise InputError(
+                f"filter '{name_of(filter_)}' works on a sensor {' or '.join(sensors)}, not '{model}'; "
+                f"filters that fit: {', '.join(fitting)}"
+            )
+        for key in getattr(filter_, "needs", ()):
+            if getattr(belief.sensor, key) is None:
+                unit = f"{key}{UNITS.get(key, '')}"
+                place = f"key 'belief.sensor.{unit}'" if log is None else f"{log}/sensor.toml: key '{unit}'"
+                raise InputError(f"{place}: missing; filter '{name_of(filter_)}' needs it, so add it or leave it out")
+    return instances

@@ -1,11 +1,23 @@
-"""Differential-drive motion, Herath, Kodagoda & Dissanayake (2007) eq. 18."""
+"""Differential-drive motion, Herath, Kodagoda & Dissanayake (2007) eq. 18, and what kernels may call."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
 
-from consistency.bench.models.jitable import Number, jitable
 from consistency.referee.types import Array
+
+F = TypeVar("F", bound=Callable[..., Any])
+Number = TypeVar("Number", float, Array)  # what a model takes and gives: numbers, or arrays of one shape
+_waiting: list[Callable[..., Any]] = []
+
+
+def jitable(function: F) -> F:
+    """Decorator: the function stays plain Python, and Numba compiles it where a kernel calls it."""
+    _waiting.append(function)
+    return function
 
 
 @jitable
@@ -40,3 +52,11 @@ def dead_reckoning(start: Array, controls: Array) -> Array:
     x = start[0] + np.concatenate([[0.0], np.cumsum(dx)])
     y = start[1] + np.concatenate([[0.0], np.cumsum(dy)])
     return np.column_stack([x, y, heading])
+
+
+def register_jitables() -> None:
+    """Tell Numba of what is jitable, before a kernel is compiled: Numba is slow to load, and verdicts do without it."""
+    from numba.extending import register_jitable
+
+    while _waiting:
+        register_jitable(no_cpython_wrapper=True, no_cfunc_wrapper=True)(_waiting.pop())

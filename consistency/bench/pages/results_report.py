@@ -16,19 +16,16 @@ from consistency.bench.pages.sections.filters_table import filters_table
 from consistency.bench.pages.sections.report_input import Report, Study, Track
 from consistency.bench.pages.sections.several_studies import provenance
 from consistency.bench.pages.sections.study_sections import SECTIONS
-from consistency.bench.runs.experiment_scripts import figure_scripts
-from consistency.bench.runs.reproduce_findings import read_findings
-from consistency.bench.runs.results_to_records import design_of, longest_run, record_of
-from consistency.bench.runs.scores_by_run import nis_ratio
+from consistency.bench.runs.reproduce_findings import figure_scripts, read_findings
+from consistency.bench.runs.results_to_records import design_of, longest_run, nis_ratio, record_of
 from consistency.bench.store.results import open_results
 from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.verdict.answers import Settings
-from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.verdict.parts import STATUSES, Settings
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural
 from consistency.referee.document.blocks import Chapter, Document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.judged_estimators import time_axis_of
+from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.system.folders import read_manifest
 from consistency.referee.system.progress import Advance
 

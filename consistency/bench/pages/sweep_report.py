@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.bench.sweeps.regime_map import Regime, by_verdict
-from consistency.bench.sweeps.run_cell import CellResult
-from consistency.bench.sweeps.sweep_axes import Axis as GridAxis
+from consistency.bench.sweeps.run_sweep import CellResult
+from consistency.bench.sweeps.sweep_file import Axis as GridAxis
 from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import values_of
 from consistency.referee.diagnostics.words.numbers import names_in_a_row
 from consistency.referee.document.blocks import (
+    COLOURS,
+    EXPECTED,
     Block,
     Cell,
     Chapter,
@@ -27,16 +29,19 @@ from consistency.referee.document.blocks import (
     Document,
     Facts,
     Figure,
+    Look,
     Small,
     Stack,
     Table,
     Text,
+    brief,
+    number,
+    solid,
+    style,
     table,
 )
-from consistency.referee.document.colours import COLOURS, EXPECTED, Look, solid, style
-from consistency.referee.document.wording import brief, number
-from consistency.referee.pages.manifest_facts import facts
-from consistency.referee.show.matplotlib_style import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
+from consistency.referee.pages.write_pages import facts
+from consistency.referee.show.figures import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

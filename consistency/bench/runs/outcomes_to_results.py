@@ -1,31 +1,148 @@
-"""From the outcomes of runs, as they come, to results: in memory, or in a folder without holding them."""
+"""From the outcomes of runs, as they come, to results.
+
+In rounds of more and more runs, resumed where a folder has some already.
+"""
 
 from __future__ import annotations
 
 import heapq
+import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import astuple, dataclass
 from itertools import pairwise, takewhile
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from consistency.bench.runs.run_outcome import RunOutcome
-from consistency.bench.store.folder_tables import with_tables
-from consistency.bench.store.journal import Journal
-from consistency.bench.store.parquet import OPTIONAL, Columns, Writer, write_table
-from consistency.bench.store.results import JOINT, MAP_NUMBERS, NUMBERS, OWN_NUMBERS, Results, StoredResults, Tables
-from consistency.bench.store.trial_tables import Rejected, noted_table, stacked_table
+from consistency.bench.filters.filter_declarations import name_of, optimal_gain
+from consistency.bench.runs.run_outcome import RunOutcome, TrialWork, Workers
+from consistency.bench.store.journal import IN_MEMORY, Journal, Unfinished
+from consistency.bench.store.parquet import (
+    OPTIONAL,
+    Columns,
+    Rejected,
+    Writer,
+    noted_table,
+    stacked_table,
+    with_tables,
+    write_table,
+)
+from consistency.bench.store.results import (
+    JOINT,
+    MAP_NUMBERS,
+    NUMBERS,
+    OWN_NUMBERS,
+    Results,
+    StoredResults,
+    Tables,
+    open_results,
+)
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import NewFolder
-from consistency.referee.system.provenance import this_machine
+from consistency.referee.system.folders import NewFolder, in_words, manifest_of, this_machine
+from consistency.referee.system.progress import progress, say
 from consistency.referee.system.stopping import away_from_signals
 from consistency.referee.types import Failure
+
+PLAN = "until_decided"
+KEYS = {
+    "scenario_hash": "scenario", "log_sha256": "log", "filters": "filter", "error": "error of a filter", "seed": "seed",
+    "screening": "--screen", PLAN: "plan of looks",
+}  # fmt: skip
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in :func:`run_trials` without a folder; ``results`` holds the runs that were finished."""
+
+    def __init__(self, results: Results | StoredResults) -> None:
+        super().__init__("interrupted")
+        self.results = results
+
+
+class StudyRounds:
+    """Runs that are done and gathered.
+
+    Parameters
+    ----------
+    workers, work : who does the runs, and what is done for each
+    gathered : where outcomes go, and what is there
+    fields : of the manifest
+    landmarks : table of those of the world, where they are known
+    """
+
+    def __init__(
+        self,
+        workers: Workers,
+        work: TrialWork,
+        gathered: Gathered,
+        fields: Mapping[str, Any],
+        landmarks: pd.DataFrame | None,
+    ) -> None:
+        self.workers, self.work, self.gathered, self.landmarks = workers, work, gathered, landmarks
+        gains = [name_of(f) for f in work.filters if optimal_gain(f)]
+        machines, filters = gathered.other_machines, gathered.filters
+        self._fields = dict(fields) | {"machines": machines, "filters": filters, "optimal_gain": gains}
+        if gathered.errors:
+            self._fields["error"] = gathered.errors
+
+    def so_far(self, runs: int) -> SoFar:
+        """Runs 0 to ``runs`` - 1 of what is there, to be read while more come."""
+        failures, rejections = self.gathered.noted()
+        return SoFar(
+            self.gathered, runs, self._fields, failures[failures["run"] < runs], self.landmarks,
+            None if rejections is None else rejections[rejections["run"] < runs],
+        )  # fmt: skip
+
+    def finish(self, rounds: Iterable[Sequence[int]]) -> Results | StoredResults:
+        """Do the runs of each round that are not there, one round after the other, and hand over the results.
+
+        Each round has the runs of those before, too. What is there can be read before the next one is asked for.
+        A journal may hold more runs than the rounds ask for; they are handed over with the others.
+
+        Raises
+        ------
+        Interrupted
+            Ctrl-C, where no journal keeps what there is.
+        """
+        runs: Sequence[int] = ()
+        started, is_ready = time.monotonic(), False
+        try:
+            for runs in rounds:
+                todo = sorted(set(runs) - self.gathered.finished)
+                if todo and not is_ready:
+                    self.workers.prepare(self.work, todo[0])
+                    started, is_ready = time.monotonic(), True
+                if todo:
+                    self._do(todo)
+        except KeyboardInterrupt:
+            if self.gathered.journal.is_on_disk:
+                raise
+            raise Interrupted(self._results(runs, started)) from None
+        return self._results(runs, started)
+
+    def _do(self, runs: Sequence[int]) -> None:
+        with closing(self.workers.outcomes(self.work, runs)) as outcomes, progress("runs", len(runs)) as advance:
+            for outcome in outcomes:
+                self.gathered.add(outcome)
+                advance(1)
+
+    def _results(self, runs: Sequence[int], started: float) -> Results | StoredResults:
+        """The results of what is there, of which ``runs`` were asked for."""
+        finished = self.gathered.finished
+        runs_beyond = finished.difference(runs)
+        total = max(runs_beyond) + 1 if runs_beyond else len(runs)
+        fields = self._fields | {"machines": self.gathered.machines()}
+        is_complete = len(finished) == total
+        if not is_complete:
+            fields["finished_runs"] = len(finished)
+        wall = time.monotonic() - started
+        manifest = manifest_of(wall=wall, complete=is_complete, runs=total, **fields)
+        return self.gathered.results(manifest, self.landmarks)
 
 
 class Gathered:
@@ -199,3 +316,80 @@ class SoFar(Tables):
             for piece in takewhile(lambda piece: piece["run"][0] < self.runs, self.gathered.pieces(table, name)):
                 all_nan = np.full(len(piece["run"]), np.nan)
                 yield {column: piece.get(column, all_nan) for column in columns}
+
+
+@contextmanager
+def gathered_in(
+    study: Mapping[str, Any],
+    out: Path | None,
+    previous: Tables | None,
+    resume: bool,
+    overwrite: bool,
+    journal: Journal | None = None,
+) -> Iterator[Gathered]:
+    """Yield what there is of a ``study``, which is known by :data:`KEYS`, to be continued.
+
+    Results go to ``out``, or stay in memory. A ``journal`` in its place keeps the finished runs of results in memory.
+    With ``resume``, or where ``previous`` are the results in ``out``, what is in ``out`` and in its journal is
+    continued, and whatever else is in the folder stays.
+
+    Raises
+    ------
+    InputError
+        What is there is of another study; ``out`` cannot be written, or is taken; unfinished work is in the way.
+    """
+    if journal is not None:
+        yield Gathered(study["filters"], study["error"], journal)
+        return
+    if out is None:
+        with closing(Journal(IN_MEMORY)) as in_memory:
+            yield _gathered(study, in_memory, None, previous)
+        return
+    resume = resume or (isinstance(previous, StoredResults) and previous.folder.resolve() == out.resolve())
+    with Unfinished(out, resume, overwrite) as unfinished:
+        before = unfinished.journal.study
+        replaces = bool(before.get("overwrite", overwrite and not resume))
+        if resume and not out.exists() and unfinished.is_new:
+            raise InputError(f"--out {out}: there is nothing to resume; leave --resume out")
+        if resume and previous is None and not replaces and out.exists():
+            previous = open_results(out)
+        goes_on = resume and not replaces and out.exists()
+        with NewFolder(out, "results", replaces or goes_on, goes_on, within=unfinished.path) as new:
+            gathered = _gathered(study, unfinished.journal, new, previous)
+            machines = [*gathered.other_machines, this_machine()]
+            unfinished.journal.begin(dict(study) | {"overwrite": replaces, "machines": machines})
+            try:
+                yield gathered
+            except InputError as error:
+                finished = len(gathered.finished)
+                if new.is_placed or not finished or not isinstance(error.__cause__, OSError):
+                    raise
+                raise InputError(
+                    f"{error}; {finished} finished runs are kept, and the same command with --resume continues"
+                ) from error.__cause__
+            finally:
+                unfinished.is_over = new.is_placed
+
+
+def _gathered(study: Mapping[str, Any], journal: Journal, new: NewFolder | None, previous: Tables | None) -> Gathered:
+    sources = [{}] if previous is None else [previous.manifest]
+    sources += [journal.study] if journal.runs else []
+    machines: list[dict[str, str]] = []
+    for source in sources:
+        _require_same(study, source)
+        machines += [machine for machine in source.get("machines", []) if machine not in machines]
+    this = this_machine()
+    if others := [machine for machine in machines if machine != this]:
+        say(
+            f"consistency: {in_words(others)} computed the runs that are there, this is {in_words([this])}: "
+            "the last digits of the others may differ from those of one machine"
+        )
+    return Gathered(study["filters"], study["error"], journal, new, previous, others)
+
+
+def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    """Refuse to continue from runs of something else; a study with a fixed number of runs has no plan to differ."""
+    for key, what_differs in KEYS.items() if before else ():
+        value_now, value_before = study.get(key), before.get(key, {} if key == "error" else None)
+        if value_now != value_before and not (key == PLAN and None in (value_now, value_before)):
+            raise InputError(f"the results to resume have another {what_differs}; use the same command as before")

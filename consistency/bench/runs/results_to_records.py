@@ -1,4 +1,4 @@
-"""Results of the bench as records: the way from their tables to the referee.
+"""Results of the bench as records of the referee, verdicts on them, and what they say run by run.
 
 Beside the error of its own, which a filter states the covariance of, a record has the additive one of the pose in the
 world. Maps are read when they are asked for.
@@ -10,26 +10,66 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from scipy import stats
 
 from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
-from consistency.referee.diagnostics.records.large_arrays import by_runs
-from consistency.referee.diagnostics.records.record import JointNees, MapRecord, Record, Rejections
+from consistency.referee.diagnostics.questions import scale
+from consistency.referee.diagnostics.questions.planning import Design, sequential_design
+from consistency.referee.diagnostics.records.record import JointNees, MapRecord, Record, Rejections, Skip
+from consistency.referee.diagnostics.records.whitening import by_runs, by_steps
+from consistency.referee.diagnostics.verdict.parts import Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE, planar_error
+from consistency.referee.geometry import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line
 from consistency.referee.readers.formats.innovation_files import NisLog, choose
 from consistency.referee.readers.formats.sheet import checked_dof
 from consistency.referee.types import Array, Failure, Indices
-from consistency.referee.verdicts.judge_sources import Source
+from consistency.referee.verdicts.judge_sources import Source, judge_all
 
 INNOVATIONS = ["run", "step", "t", "nis", "nis_dof"]
 POINT = ("x", "y", "z")
+
+if TYPE_CHECKING:
+    from consistency.bench.store.results import Tables
+
+    AnyResults = Source | Sequence[Record] | Tables | str | Path
+
+
+def analyse(
+    results: AnyResults,
+    filters: Sequence[str] | None = None,
+    confidence: float | None = None,
+    settings: Settings | None = None,
+    skip: str | float | Skip | None = None,
+    optimal_gain: bool = False,
+) -> dict[str, Verdict]:
+    """Judge every filter of the results, or those named.
+
+    Parameters
+    ----------
+    results : of ``consistency.run_trials``, a folder of them, or a sequence of records
+    confidence : 1 - the false-alarm rate of a verdict, in place of ``settings``
+    settings : what to ask; the defaults of :class:`Settings` where None. Results of a run until decided are then
+        judged as that run was.
+    skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
+    optimal_gain : the filters declare one, so that their innovations are judged; results say it themselves
+
+    Raises
+    ------
+    InputError
+        Unknown filter, a confidence outside (0, 1), or nothing is left.
+    """
+    if isinstance(results, Source | list | tuple):
+        source: Source | Sequence[Record] = results
+    else:
+        source = results_source(cast("Tables | str | Path", results))
+    return judge_all(source, filters, confidence, settings, skip, optimal_gain)
 
 
 def records_of_results(results: Tables, filters: Sequence[str] | None = None) -> Iterator[Record]:
@@ -351,3 +391,40 @@ def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> Ni
     return NisLog(
         name, step, t, nis, checked_dof(nis, dof, lambda row: f"{folder}, run {run_number}, step {step[row]:g}")
     )
+
+
+def log_rmse(of: Record, axes: Sequence[int]) -> Array:
+    """log RMSE of some axes of the pose together in each run, in the world, shape (R,); NaN where it failed."""
+    error = of.in_world.error
+    assert error is not None
+    value: Array = 0.5 * np.log(np.square(error[:, :, list(axes)]).sum(axis=2).mean(axis=1))
+    return value
+
+
+def mean_nees_of_runs(of: Record) -> Array:
+    """Mean NEES of each run over its judged steps, in the filter's own error, shape (R,); infinite for a failed run."""
+    assert of.nees is not None
+    means, count = scale.run_means(of.nees)
+    means[count == 0] = np.inf
+    means[np.isin(of.run_numbers, [failure.run for failure in of.failures])] = np.inf
+    return np.asarray(means)
+
+
+def nis_ratio(of: Record, runs: int) -> Array:
+    """NIS of the first ``runs`` runs over their degrees of freedom in each step, (T,)."""
+    assert of.nis is not None
+    assert of.nis_dof is not None
+    return by_steps(_ratio, of.nis[:runs], of.nis_dof[:runs])
+
+
+def _ratio(nis: Array, nis_dof: Array) -> Array:
+    has_nis = np.isfinite(nis) & (nis_dof > 0)
+    dof = np.where(has_nis, nis_dof, 0).sum(axis=0)
+    total = np.where(has_nis, nis, 0.0).sum(axis=0)
+    return np.asarray(np.where(dof > 0, total / np.maximum(dof, 1), np.nan))
+
+
+def wins(a: Record, b: Record) -> tuple[int, float]:
+    """Runs in which ``a`` has the lower mean NEES than ``b``, and the two-sided p value of a sign test without ties."""
+    better, worse = (int((mean_nees_of_runs(x) < mean_nees_of_runs(y)).sum()) for x, y in ((a, b), (b, a)))
+    return better, float(stats.binomtest(better, better + worse).pvalue) if better + worse else 1.0

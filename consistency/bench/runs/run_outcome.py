@@ -1,25 +1,52 @@
-"""The outcome of one run: NEES and NIS of its steps, the map's, and in which step it failed, as rows of tables."""
+"""What is done for a run and what comes of it.
+
+Kernels compiled before they are needed, NEES and NIS of its steps, failures.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import os
+import pickle
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import wait
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from joblib.externals.loky import ProcessPoolExecutor
+from joblib.externals.loky.backend import get_context
+from joblib.externals.loky.backend.reduction import dumps
 
-from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.filters.compiled import Compiled, one_blas_thread
+from consistency.bench.filters.compiler import jit
+from consistency.bench.filters.compiler.jit import Outlook
+from consistency.bench.filters.filter_declarations import name_of
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.store.parquet import Columns
+from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.runs.isolation import Isolation
+from consistency.bench.scenario import Belief, Scenario
+from consistency.bench.simulation import require_landmarks_in_view
+from consistency.bench.simulation.world import World
+from consistency.bench.store.parquet import Columns, Rejected, truth_columns
 from consistency.bench.store.results import JOINT
-from consistency.bench.store.trial_tables import Rejected, truth_columns
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics.maps.map_nees import joint_nees
+from consistency.referee.diagnostics.questions.maps import joint_nees
 from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.geometry import pose_error
-from consistency.referee.geometry.conventions import planar_error, planar_map_error
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import planar_error, planar_map_error, pose_error
 from consistency.referee.parsing import LARGEST_NUMBER
+from consistency.referee.system import progress
+from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
 from consistency.referee.types import Array, Failure
+
+NAMED = 3  # filters that are named where several are compiled
+EACH = "10 to 60 s for each"
+Wanted = tuple[Filter, Trial, Belief]  # a filter, and a trial that it is to run on
 
 
 @dataclass(frozen=True)
@@ -33,6 +60,86 @@ class RunOutcome:
     maps: dict[str, Columns] = field(default_factory=dict)
     rejections: tuple[Rejected, ...] = ()
     machine: dict[str, str] | None = None
+
+
+Outcomes = Generator[RunOutcome, None, None]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Trials of a scenario.
+
+    Raises
+    ------
+    InputError
+        No landmark can ever be seen.
+    """
+
+    scenario: Scenario
+    seed: int
+
+    def __post_init__(self) -> None:
+        _ = self._world
+
+    def __call__(self, run: int) -> Trial:
+        return self._world.trial(run, self.seed)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Simulated, (self.scenario, self.seed)
+
+    @cached_property
+    def _world(self) -> World:
+        return require_landmarks_in_view(self.scenario)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Trials that are there, by number of their runs."""
+
+    trials: Mapping[int, Trial]
+
+    def __call__(self, run: int) -> Trial:
+        return self.trials[run]
+
+
+@dataclass(frozen=True)
+class TrialWork:
+    """Trials, and the filters through which each is put; it can be pickled.
+
+    Runs are done in a ``with`` on ``isolation``.
+    """
+
+    trials: Callable[[int], Trial]
+    isolation: Isolation
+
+    def __call__(self, run: int) -> RunOutcome:
+        trial = self.trials(run)
+        return outcome_of(trial, self.isolation.run(trial))
+
+    @property
+    def filters(self) -> list[Filter]:
+        return self.isolation.filters
+
+    def only(self, runs: Sequence[int]) -> TrialWork:
+        """Work with what these runs need: the trials of a log are many, those of a scenario are drawn."""
+        if not isinstance(self.trials, Recorded):
+            return self
+        return replace(self, trials=Recorded({run: self.trials.trials[run] for run in runs}))
+
+    def compile(self, trial: Trial, jobs: int) -> None:
+        """Compile what a trial needs and is not yet compiled, in ``jobs`` processes at most, and say so."""
+        belief = self.isolation.belief
+        compile_all(((filter_, trial, belief) for filter_ in self.isolation.compiled), jobs)
+
+
+class Workers(Protocol):
+    """Who does runs. The bits do not depend on it: BLAS has one thread."""
+
+    def prepare(self, work: TrialWork, run: int, /) -> None:
+        """Compile what ``run`` needs, where that is done on this machine."""
+
+    def outcomes(self, work: TrialWork, runs: Sequence[int], /) -> Outcomes:
+        """What each run left, in the order in which they end; to be closed, which stops what is not done."""
 
 
 def outcome_of(trial: Trial, estimates: Sequence[Estimates]) -> RunOutcome:
@@ -191,3 +298,108 @@ def _joint_nees(trial: Trial, estimates: Estimates, map_: Map, judged: Array) ->
             flat = np.flatnonzero(np.append([1, 1, 1], np.tile([1, 1, 0], len(landmark_ids))))
             return joint_nees(error[flat], P[np.ix_(flat, flat)], dof=2)[1:]
         return joint_nees(error, P)[1:]
+
+
+class Need(NamedTuple):
+    """A kernel, and a filter that compiles it for a trial."""
+
+    filter: Compiled
+    trial: Trial
+    belief: Belief
+    outlook: Outlook
+
+
+def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
+    """Compile each kernel that is not yet compiled, once, and say so before.
+
+    Parameters
+    ----------
+    jobs : processes that compile side by side, at most; whatever they leave undone is compiled here
+
+    Returns
+    -------
+    The kernels, those that were ready too
+    """
+    needs: dict[str, Need] = {}
+    for filter_, trial, belief in wanted:
+        if isinstance(filter_, Compiled):
+            need = Need(filter_, trial, belief, filter_.outlook(trial, belief))
+            needs.setdefault(need.outlook.key, need)
+        elif isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
+            progress.say(f"compiling {name_of(filter_)}")
+            filter_.compile(trial, belief)
+    missing = [need for need in needs.values() if not need.outlook.is_ready]
+    if missing:
+        _compile(missing, jobs)
+    return list(needs.values())
+
+
+def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
+    """Filters and a trial of the scenario that each is for; nothing where no landmark comes into view."""
+    trials: dict[str, Trial | None] = {}
+    for filter_, world in worlds:
+        if world.hash not in trials:
+            trials[world.hash] = None
+            with contextlib.suppress(InputError):
+                trials[world.hash] = require_landmarks_in_view(world).trial(0, 0)
+        if (trial := trials[world.hash]) is not None:
+            yield filter_, trial, world.belief
+
+
+def _compile(missing: Sequence[Need], jobs: int) -> None:
+    shared_kernels = [need for need in missing if need.outlook.is_shared]
+    workers = min(jobs, len(shared_kernels))
+    if jit.folder_fault():
+        workers = 1
+    progress.announce(f"{_label(missing)}, once: {EACH}")
+    if workers > 1:
+        _compile_side_by_side(shared_kernels, workers)
+    away_from_signals(_compile_here, missing)
+
+
+def _compile_here(needs: Sequence[Need]) -> None:
+    """Compile kernels one after the other; those that a process has kept on disk are loaded."""
+    for need in needs:
+        need.filter.compile(need.trial, need.belief)
+
+
+def _label(missing: Sequence[Need]) -> str:
+    filter_names = list(dict.fromkeys(name_of(need.filter) for need in missing))
+    if len(missing) == 1:
+        return f"compiling the kernel of {filter_names[0]}"
+    further_filters = f" and {len(filter_names) - NAMED} more" if len(filter_names) > NAMED else ""
+    return f"compiling {len(missing)} kernels of {', '.join(filter_names[:NAMED])}{further_filters}"
+
+
+# --- side by side ---------------------------------------------------------------------------------
+
+
+def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
+    """Compile in processes, which keep kernels on disk; what they fail at is said where it is compiled again."""
+    context = get_context("loky")
+    largest_first = sorted(needs, key=lambda need: need.outlook.size, reverse=True)
+    initargs = link_to_parent(context)
+    pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
+    try:
+        with contextlib.suppress(Exception):  # no more processes, or a filter that cannot be sent
+            wait([pool.submit(_compile_one, _pickled(need)) for need in largest_first])
+    finally:
+        pool.shutdown(kill_workers=True)
+
+
+def _pickled(need: Need) -> bytes:
+    return bytes(dumps((need.filter, need.trial, need.belief)))
+
+
+def _begin_compiler(parent: int, alive: Connection) -> None:
+    """In a process of its own: end with the parent, leave Ctrl-C to it, and say nothing."""
+    end_with_parent(parent, alive)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+
+
+def _compile_one(pickled: bytes) -> None:
+    filter_, trial, belief = pickle.loads(pickled)
+    filter_.compile(trial, belief)

@@ -6,40 +6,38 @@ ideal observation: the keys of each effect and its ``apply``. Nothing here draws
 """
 
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
+from consistency.bench.scenario.observations import PLANAR_SENSORS, Mount
 from consistency.bench.scenario.sensor import (
     BelievedSensor,
     PicturedSensor,
     TrueSensor,
     UvdSensor,
 )
-from consistency.bench.scenario.tables.sensor_view import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.tables.toml_tables import Count, Finite, Positive, Table, explain, read_table
-from consistency.bench.scenario.truth import (
+from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
+from consistency.bench.scenario.truth_and_belief import (
     AnnularLandmarks,
+    Belief,
+    BelievedMotion,
     Circle,
     CircularLandmarks,
     Corridor,
     FigureOfEight,
+    GuardSettings,
     ListedLandmarks,
     Path_,
     RoundedRectangle,
+    Scenario,
+    SigmaPoints,
     Truth,
     UniformLandmarks,
     Waypoints,
-)
-from consistency.bench.scenario.truth_and_belief import (
-    Belief,
-    BelievedMotion,
-    GuardSettings,
-    Scenario,
-    SigmaPoints,
     load_scenario,
     misbelief,
     scenario_names,
     scenario_text,
     toml_text,
 )
-from consistency.referee.system.shipped import data_folder
+from consistency.referee.system.folders import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
 from consistency.bench.scenario.effects import BUILT_IN, BiasMap, DisparityGrowth, ListedEffect
-from consistency.bench.scenario.tables.sensor_view import ImageSensor, SeeingSensor, Sensor
-from consistency.bench.scenario.tables.toml_tables import Positive
+from consistency.bench.scenario.observations import ImageSensor, SeeingSensor, Sensor
+from consistency.bench.scenario.toml_tables import Positive
 
 
 class StereoSensor(Sensor):

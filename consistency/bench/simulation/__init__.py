@@ -3,7 +3,13 @@
 Nothing here imports a filter.
 """
 
-from consistency.bench.simulation.path import planned_controls, planned_path
-from consistency.bench.simulation.world import World, draw_landmarks, require_landmarks_in_view, simulate
+from consistency.bench.simulation.world import (
+    World,
+    draw_landmarks,
+    planned_controls,
+    planned_path,
+    require_landmarks_in_view,
+    simulate,
+)
 
 __all__ = ["World", "draw_landmarks", "planned_controls", "planned_path", "require_landmarks_in_view", "simulate"]

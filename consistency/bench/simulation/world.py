@@ -1,23 +1,31 @@
-"""Trials of a scenario, each a function of (scenario, seed, run) and of nothing else."""
+"""The simulated world: paths, truth, controls and observations from a scenario and random generators."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from consistency.bench.models import motion
+from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.scenario import (
     AnnularLandmarks,
+    Circle,
     CircularLandmarks,
+    Corridor,
+    FigureOfEight,
     ListedLandmarks,
+    Path_,
+    RoundedRectangle,
     Scenario,
     TrueSensor,
     Truth,
+    UniformLandmarks,
     UvdSensor,
+    Waypoints,
     load_scenario,
 )
 from consistency.bench.scenario.effects import (
@@ -29,12 +37,15 @@ from consistency.bench.scenario.effects import (
     Observations,
     SearchRange,
 )
-from consistency.bench.simulation.path import planned_controls, start_pose
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
 MOTION_NOISE, OBSERVATION_NOISE = 0, 1  # purposes in the spawn key of the seed
+SOME = 50  # steps of the planned path that are searched at a time for a landmark
+Changes = dict[str, Any]  # dotted key of the scenario -> value
+HALVES = ("truth", "belief")
+SHAPES = ("circle", "rounded-rectangle", "figure-of-eight")
 
 
 def generator(seed: int, run: int, purpose: int) -> np.random.Generator:
@@ -117,9 +128,6 @@ def _require_sound(label: str, observations: Observations, context: Context) -> 
             f"the effect '{label}' (truth.sensor.effects) observes things that are not landmarks, and a linear sensor "
             "has nothing to be linearised about for them; use the model 'xyz' or 'uvd'"
         )
-
-
-SOME = 50  # steps of the planned path that are searched at a time for a landmark
 
 
 class World:
@@ -255,3 +263,198 @@ def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:
         path[1:, axis] += np.cumsum(np.column_stack([slope * pose_before, along * share]))[1::2]
     path[1:, 2] += turned
     return path
+
+
+class Piece(NamedTuple):
+    """A part of a path that is driven with constant velocities."""
+
+    duration: float  # s
+    v: float  # m/s
+    omega: float  # rad/s
+
+
+def planned_controls(truth: Truth) -> Array:
+    """Velocities along the scenario's path, shape (steps, 3): dt (s), v (m/s), omega (rad/s).
+
+    A step holds the mean of v and omega over it, so that every turn is made in full.
+    """
+    duration, v, omega = np.array(_pieces(truth.path)).T
+    ends = np.concatenate([[0.0], np.cumsum(duration)])
+    travelled = np.concatenate([[0.0], np.cumsum(duration * v)])
+    turned = np.concatenate([[0.0], np.cumsum(duration * omega)])
+    time = truth.dt * np.arange(truth.steps + 1)
+    laps, phase = np.divmod(time, ends[-1])
+    distance = laps * travelled[-1] + np.interp(phase, ends, travelled)
+    angle = laps * turned[-1] + np.interp(phase, ends, turned)
+    dt = np.full(truth.steps, truth.dt)
+    return np.column_stack([dt, np.diff(distance) / truth.dt, np.diff(angle) / truth.dt])
+
+
+def start_pose(truth: Truth) -> Array:
+    """Pose at step 0, shape (3,)."""
+    return np.array([*truth.path.start, truth.path.heading])
+
+
+def planned_path(truth: Truth) -> Array:
+    """Poses 0..steps of the path without any noise, shape (steps + 1, 3)."""
+    return dead_reckoning(start_pose(truth), planned_controls(truth))
+
+
+def lap_length(path: Path_) -> float:
+    """Length in m of the path until it is back at its start; turns on the spot have none."""
+    return sum(piece.duration * piece.v for piece in _pieces(path))
+
+
+def _pieces(path: Path_) -> list[Piece]:
+    """One cycle of the path, all counter-clockwise."""
+    v = path.speed
+    match path:
+        case Circle():
+            return [_arc(v, path.radius, 2 * np.pi)]
+        case FigureOfEight():
+            return [_arc(v, path.radius, 2 * np.pi), _arc(v, path.radius, -2 * np.pi)]
+        case RoundedRectangle():
+            corner = _arc(v, path.corner_radius, np.pi / 2)
+            long = (path.length - 2 * path.corner_radius) / v
+            wide = (path.width - 2 * path.corner_radius) / v
+            half = [Piece(long / 2, v, 0.0), corner, Piece(wide, v, 0.0), corner, Piece(long / 2, v, 0.0)]
+            return [piece for piece in half * 2 if piece.duration > 0]
+        case Corridor():
+            straight, turn = Piece(path.length / v, v, 0.0), _arc(v, path.turn_radius, np.pi)
+            return [straight, turn, straight, turn]
+        case Waypoints():
+            return _legs(path)
+
+
+def _arc(v: float, radius: float, angle: float) -> Piece:
+    duration = abs(angle) * radius / v
+    return Piece(duration, v, angle / duration)
+
+
+def _legs(path: Waypoints) -> list[Piece]:
+    """Turn on the spot towards each point, drive there; at the end back to the start and its heading."""
+    pieces: list[Piece] = []
+    position, heading = np.array(path.start), path.heading
+
+    def turn_to(target: float) -> None:
+        angle = (target - heading + np.pi) % (2 * np.pi) - np.pi
+        if abs(angle) > 1e-12:
+            pieces.append(Piece(abs(angle) / path.turn_rate, 0.0, np.sign(angle) * path.turn_rate))
+
+    for point in [*path.points, path.start]:
+        dx, dy = np.array(point) - position
+        length = float(np.hypot(dx, dy))
+        if length == 0.0:
+            continue
+        target = float(np.arctan2(dy, dx))
+        turn_to(target)
+        pieces.append(Piece(length / path.speed, path.speed, 0.0))
+        position, heading = np.array(point), target
+    turn_to(path.heading)
+    return pieces
+
+
+class Course(NamedTuple):
+    """A path, and the box of landmarks about it."""
+
+    path: Path_
+    x: tuple[float, float]  # m
+    y: tuple[float, float]  # m
+    landmarks: float  # number of them that are as dense as before
+
+
+def course_of(truth: Truth, shape: str, lap: float = 1.0) -> Course:
+    """A path of one of :data:`SHAPES` about the same centre, its lap ``lap`` times as long.
+
+    Raises
+    ------
+    ValueError
+        The landmarks are not spread evenly over a box, or there is no such shape.
+    """
+    landmarks = truth.landmarks
+    if not isinstance(landmarks, UniformLandmarks):
+        raise ValueError("needs truth.landmarks.layout = 'uniform', whose box follows the path")
+    if shape not in SHAPES:
+        raise ValueError(f"a path of shape '{shape}' has no laps; use {', '.join(SHAPES)}")
+    path, box = _path(shape, truth, lap), np.array([landmarks.x, landmarks.y])
+    margin = box - _extent(truth)
+    x, y = np.round(_extent(truth.model_copy(update={"path": path})) + margin.mean(axis=0), 1).tolist()
+    area = float((x[1] - x[0]) * (y[1] - y[0]) / np.prod(box[:, 1] - box[:, 0]))
+    return Course(path, (x[0], x[1]), (y[0], y[1]), landmarks.count * area)
+
+
+def in_both(key: str, value: Any) -> Changes:
+    """A key of truth and belief alike."""
+    return {f"{half}.{key}": value for half in HALVES}
+
+
+def baseline_changes(base: Scenario, baseline: float) -> Changes:
+    """Another baseline (m); the largest disparity of the search grows with it, so that the nearest depth stays."""
+    if base.truth.sensor.rig is None:
+        raise ValueError(f"a sensor '{base.truth.sensor.model}' has no baseline")
+    ratio = baseline / base.truth.sensor.rig[1]
+    changes = in_both("sensor.B", baseline)
+    for half in HALVES:
+        disparity = getattr(getattr(base, half).sensor, "disparity", None)
+        if disparity is not None:
+            changes[f"{half}.sensor.disparity"] = (disparity[0], disparity[1] * ratio)
+    return changes
+
+
+def odometry_changes(base: Scenario, factor: float) -> Changes:
+    """Noise of the odometry times a factor."""
+    changes: Changes = {}
+    for half in HALVES:
+        motion = getattr(base, half).motion
+        changes[f"{half}.motion.sigma_v"] = factor * motion.sigma_v
+        changes[f"{half}.motion.sigma_omega"] = factor * motion.sigma_omega
+    return changes
+
+
+def range_changes(base: Scenario, far: float) -> Changes:
+    """The longest range of the sensor, m."""
+    return {"truth.sensor.range": (base.truth.sensor.range[0], far)}
+
+
+def tilt_changes(base: Scenario, tilt: float) -> Changes:
+    """A camera turned to a tilt (deg, positive looks down)."""
+    roll, _, heading = _stereo_camera(base).mount.rotation
+    return in_both("sensor.mount.rotation", (roll, float(np.deg2rad(tilt)), heading))
+
+
+def height_changes(base: Scenario, height: float) -> Changes:
+    """A camera moved to a height (m)."""
+    x, y, _ = _stereo_camera(base).mount.position
+    return in_both("sensor.mount.position", (x, y, height))
+
+
+def _stereo_camera(base: Scenario) -> UvdSensor:
+    sensor = base.truth.sensor
+    if not isinstance(sensor, UvdSensor):
+        raise ValueError(f"a sensor '{sensor.model}' has no tilt or height")
+    return sensor
+
+
+def _path(shape: str, truth: Truth, lap: float) -> Path_:
+    """A path of another shape about the centre of the base, ``lap`` times as long, with sides of 8 to 5."""
+    length, (x, y) = lap * lap_length(truth.path), np.round(_extent(truth).mean(axis=1), 1)
+    speed = truth.path.speed
+    if shape == "circle":
+        radius = round(length / (2 * np.pi), 2)
+        return Circle(shape="circle", radius=radius, start=(x + radius, y), heading=np.pi / 2, speed=speed)
+    if shape == "figure-of-eight":
+        radius = round(length / (4 * np.pi), 2)
+        return FigureOfEight(shape="figure-of-eight", radius=radius, start=(x, y), heading=0.0, speed=speed)
+    corner = round(length / 25, 2)
+    long, wide = (round((length + (8 - 2 * np.pi) * corner) * side / 26, 2) for side in (8, 5))
+    return RoundedRectangle(
+        shape="rounded-rectangle", length=long, width=wide, corner_radius=corner, start=(x, y - wide / 2), heading=0.0,
+        speed=speed,
+    )  # fmt: skip
+
+
+def _extent(truth: Truth) -> Array:
+    """Smallest and largest x and y of one lap of the path, (2, 2)."""
+    steps = int(np.ceil(lap_length(truth.path) / truth.path.speed / truth.dt))
+    path = planned_path(truth.model_copy(update={"steps": steps}))
+    return np.column_stack([path[:, :2].min(axis=0), path[:, :2].max(axis=0)])

@@ -1,26 +1,28 @@
-"""Tables as Parquet: written piece by piece, in row groups that do not depend on the pieces; read back with checks."""
+"""Tables as Parquet: written piece by piece, digested in the manifest, and read back with checks."""
 
 from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from consistency.referee.column_names import COLUMNS, OWN_COVARIANCE
+from consistency.bench.types import Trial
+from consistency.referee.column_names import COLUMNS, OWN_COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading
 from consistency.referee.readers.formats.parquet_file import open_parquet
-from consistency.referee.types import Array
-
-if TYPE_CHECKING:
-    import pandas as pd
+from consistency.referee.system import folders
+from consistency.referee.system.folders import NewFolder
+from consistency.referee.types import Array, Failure
 
 OPTIONAL = {  # columns of a table that may be missing
     "observations": {"z2": "float64", "source": "int64"},  # z2 by sensors of three values
@@ -36,9 +38,8 @@ REPEATED = {"t", "dt"}  # floating-point columns of few different values
 ROWS = 65_536  # of a row group, and of a batch that is read
 TYPES = {"str": pa.string(), "int64": pa.int64(), "float64": pa.float64()}
 NO_NUMBERS = (bool, np.bool_, datetime.date, datetime.timedelta, np.datetime64, np.timedelta64)
-
 Columns = dict[str, Array]  # columns of a table by name, equally long
-
+TABLES = (".parquet", ".csv")  # the latter of logs alone
 
 # --- writing -------------------------------------------------------------------------------------
 
@@ -268,3 +269,134 @@ def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) 
     if kind == "int64" and ((values != np.round(values)) | (np.abs(values) > WHOLE)).any():
         row = int(np.flatnonzero((values != np.round(values)) | (np.abs(values) > WHOLE))[0])
         raise InputError(f"{path}: column '{column.name}', row {first + row}: not a whole number ({values[row]})")
+
+
+def write_tables(
+    folder: Path,
+    tables: dict[str, pd.DataFrame],
+    manifest: dict[str, Any],
+    extra: Callable[[Path], None] | None = None,
+    overwrite: bool = False,
+    keep_others: bool = False,
+) -> None:
+    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as :func:`folders.write_folder`."""
+
+    def contents(at: Path) -> None:
+        for name, table in tables.items():
+            write_table(at / f"{name}.parquet", name, table)
+        if extra is not None:
+            extra(at)
+
+    folders.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
+
+
+def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
+    """The manifest with what tables there are; of results also their rows and digests. Logs may be edited."""
+    tables = sorted(COLUMNS.keys() & {file.stem for file in new.path.iterdir() if file.suffix in TABLES})
+    manifest = manifest | {"tables": tables}
+    if new.kind == "results":
+        with new.writing():
+            manifest["contents"] = {name: _content_of(new.path, name) for name in tables}
+    return manifest
+
+
+def _content_of(folder: Path, name: str) -> dict[str, Any]:
+
+    return {"rows": require_table(folder, name).metadata.num_rows, "sha256": _digest(folder / f"{name}.parquet")}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def require_unchanged(folder: Path, manifest: dict[str, Any]) -> None:
+    """Refuse tables that are not those that were written with the manifest; one of before has nothing to say.
+
+    Raises
+    ------
+    InputError
+        A table was edited, replaced or damaged, or is missing; the manifest names none of this bench.
+    """
+    written_contents = manifest.get("contents", {})
+    if not isinstance(written_contents, dict) or not written_contents.keys() <= COLUMNS.keys():
+        raise InputError(f"{folder / 'manifest.json'}: key 'contents' must have tables as keys; write the folder again")
+    for name in written_contents:
+        path = folder / f"{name}.parquet"
+        try:
+            content_now = _content_of(folder, name)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+        if content_now != written_contents[name]:
+            raise InputError(
+                f"{path}: is not as it was written, but damaged or edited; write the folder again, or, if the change "
+                f"is meant, take '{name}' out of the key 'contents' of manifest.json"
+            )
+
+
+class Rejected(NamedTuple):
+    """How many observations a guard was offered in a run, and what it rejected; a row of ``rejections``."""
+
+    filter: str
+    run: int
+    offered: int
+    spurious: int
+    rejected: int
+    rejected_spurious: int
+
+
+def truth_columns(trial: Trial, path: Array) -> Columns:
+    return {
+        "run": np.full(len(path), trial.run),
+        "step": np.arange(len(path)),
+        "t": trial.t,
+        **dict(zip(POSE, path.T, strict=True)),
+    }
+
+
+def stacked_table(name: str, parts: Sequence[tuple[str, Columns]], also: Sequence[str] = ()) -> pd.DataFrame:
+    """Table ``name`` of (filter, columns), one below the other; NaN where a column is lacking, one of ``also`` too.
+
+    The columns are nobody else's: pandas would copy them, at millions of rows half the memory.
+    """
+    table = pd.DataFrame(columns=list(COLUMNS[name])).astype(COLUMNS[name])
+    if parts:
+        rows, stacked = [len(columns["run"]) for _, columns in parts], dict[str, Any]()
+        if name in BY_FILTER:
+            filter_names = pd.Series([filter_name for filter_name, _ in parts], dtype="str")
+            stacked["filter"] = filter_names.repeat(rows).reset_index(drop=True)
+        for column in dict.fromkeys(column for _, part in parts for column in part):
+            pairs = zip(parts, rows, strict=True)
+            column_pieces = [part[column] if column in part else np.full(n, np.nan) for (_, part), n in pairs]
+            stacked[column] = np.concatenate(column_pieces)
+        table = pd.DataFrame(stacked, copy=False)
+    missing_columns = [column for column in also if column not in table]
+    return table.assign(**dict.fromkeys(missing_columns, np.nan)) if missing_columns else table
+
+
+def noted_table(name: str, rows: Sequence[Failure | Rejected]) -> pd.DataFrame:
+    """``failures.parquet`` or ``rejections.parquet``."""
+    return pd.DataFrame(rows, columns=list(COLUMNS[name])).astype(COLUMNS[name])
+
+
+def controls_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    tables = []
+    for trial in trials:
+        columns: Columns = {"run": np.full(trial.steps, trial.run), "step": np.arange(1, trial.steps + 1)}
+        columns |= dict(zip(["dt", "v", "omega"], trial.controls.T, strict=True))
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def observations_table(trials: Sequence[Trial]) -> pd.DataFrame:
+    """``observations.parquet``; with a column ``source`` if a row is not of the landmark that it says."""
+    has_sources = any(trial.source is not None for trial in trials)
+    tables = []
+    for trial in trials:
+        columns: Columns = {"run": np.full(len(trial.landmark), trial.run), "step": trial.step}
+        columns["landmark"] = trial.landmark
+        columns |= dict(zip(["z0", "z1", "z2"], trial.z.T, strict=False))
+        if has_sources:
+            columns["source"] = trial.landmark if trial.source is None else trial.source
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)

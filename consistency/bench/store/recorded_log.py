@@ -26,10 +26,18 @@ from consistency.bench.scenario import (
     read_table,
     toml_text,
 )
-from consistency.bench.scenario.tables.toml_tables import SIGMA_UNITS
-from consistency.bench.store.folder_tables import write_tables
-from consistency.bench.store.parquet import OPTIONAL, check_column, read_parquet, require_table
-from consistency.bench.store.trial_tables import controls_table, observations_table, stacked_table, truth_columns
+from consistency.bench.scenario.toml_tables import SIGMA_UNITS
+from consistency.bench.store.parquet import (
+    OPTIONAL,
+    check_column,
+    controls_table,
+    observations_table,
+    read_parquet,
+    require_table,
+    stacked_table,
+    truth_columns,
+    write_tables,
+)
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
 from consistency.referee.errors import InputError

@@ -14,18 +14,24 @@ import numpy as np
 import pandas as pd
 
 from consistency.bench.scenario import data_folder
-from consistency.bench.sweeps.run_cell import CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.run_sweep import (
+    CellResult,
+    SweepFolder,
+    describe,
+    open_sweep,
+    plain_numbers,
+    result_from,
+    sweep_from,
+)
 from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import Sweep, values_of
-from consistency.bench.sweeps.sweep_folder import SweepFolder, describe, open_sweep, sweep_from
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.words.numbers import short
-from consistency.referee.document.blocks import Block, Cell, Column, Status, Table, Text, table
-from consistency.referee.document.wording import NONE
+from consistency.referee.document.blocks import NONE, Block, Cell, Column, Status, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.pages.write_pages import write_file
 from consistency.referee.parsing import read_json, reading
-from consistency.referee.system.provenance import SCHEMA_VERSION, manifest_of
+from consistency.referee.system.folders import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
 SHIPPED = "regime.json"

@@ -1,4 +1,4 @@
-"""The setting of greatest score, and how well it is known. Knows no filter: scores in, factors out.
+"""Factors on noises by the log density that a filter gives to its innovations, and how well they are known.
 
 Intervals of log factors are those of the profile of a score that need not be a true likelihood.
 
@@ -12,16 +12,28 @@ as far as any setting that is not outside.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 from scipy.optimize import NonlinearConstraint, minimize
 
+from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.filters.filter_declarations import name_of, rejects
+from consistency.bench.protocols import Filter
+from consistency.bench.runs.isolation import Isolation
+from consistency.bench.runs.run_outcome import compile_all, outcome_of
+from consistency.bench.runs.workers import worker_count
+from consistency.bench.scenario import Belief
+from consistency.bench.types import Estimates, Trial
 from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.errors import InputError
+from consistency.referee.system.progress import say
 from consistency.referee.types import Array
 
 LIMIT = float(np.log(1e4))  # factors that are tried lie within 1e-4 and 1e4
@@ -34,10 +46,18 @@ LARGEST_STEP = 1.0  # of a log factor, in which a quadratic model of the score i
 END_RADII = 0.3, 0.02  # of the trust region, first and last, in half widths of the intervals
 END_SETTINGS = 60  # at most for one end of an interval; some 15 do
 AT_LIMIT = 0.05  # in log factors from a limit
-
 NORMAL = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
-
 Scoring = Callable[[Array], Array | None]  # of log factors (p,): log densities (R, T), None where a run failed
+EVERY = 5.0  # seconds between lines of progress
+MOTION = ("v", "omega")  # channels of Q
+CHANNELS = {  # of R, by model of the sensor
+    "uvd": ("u", "v", "d"),
+    "xyz": ("x", "y", "z"),
+    "linear": ("x", "y", "z"),
+    "relative-xy": ("dx", "dy"),
+    "range-bearing": ("range", "bearing"),
+}
+DIGITS = 6  # of a tuned standard deviation, so that what is judged is what is written
 
 
 @dataclass(frozen=True)
@@ -217,3 +237,206 @@ def depth_of(at_best: Array, here: Array, factors: int) -> float:
     V = n / (n - factors) * float(((fall - fall.mean()) ** 2).sum())
     student = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, n - factors))
     return float(W / max(NORMAL * np.sqrt(W), student * np.sqrt(V)))
+
+
+class RunScore(NamedTuple):
+    """Score of one run of T steps."""
+
+    log_density: Array  # (T,), 0 in a step without an innovation
+    nis: float  # sum over the steps,
+    dof: float  # which has this expectation if the covariances are right
+    failure: str  # why the run failed, or nothing
+
+
+def require_scorable(filter_: Filter) -> None:
+    """Refuse a filter that leaves observations out: the likelihood of those it keeps prefers a small noise.
+
+    Raises
+    ------
+    InputError
+        It has a gate or a guard.
+    """
+    if rejects(filter_) or getattr(filter_, "guard", None) is not None:
+        raise InputError(
+            f"filter '{name_of(filter_)}' leaves observations out, so that its innovations say too little of the "
+            "noise; tune the filter without its guard"
+        )
+
+
+def score_of_run_by_innovations(trial: Trial, estimates: Estimates) -> RunScore:
+    """Return the likelihood of the observations of a run (Schweppe 1965, IEEE Trans. Inf. Theory 11(1), eq. 9).
+
+    The observation that begins a landmark is left out, as in a diffuse likelihood: no density is stated for it.
+
+    Raises
+    ------
+    InputError
+        The filter reports no innovations.
+    """
+    outcome = outcome_of(trial, [replace(estimates, map=None)])
+    failure = "".join(f"step {failure.step}: {failure.reason}" for failure in outcome.failures)
+    nis, dof, log_det = estimates.nis, estimates.nis_dof.astype(float), estimates.log_det
+    if log_det is None or not np.isfinite(log_det).any():
+        if not failure:
+            raise InputError(
+                f"filter '{estimates.filter}' reports no innovations: its update must return an Info with innovation "
+                "and S"
+            )
+        log_det = np.full(len(nis), np.nan)
+    has_innovation = np.isfinite(nis) & np.isfinite(log_det) & (dof > 0)
+    density = np.where(has_innovation, -0.5 * (nis + log_det + dof * np.log(2.0 * np.pi)), 0.0)
+    return RunScore(density, float(nis[has_innovation].sum()), float(dof[has_innovation].sum()), failure)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of R runs of up to T steps at one setting."""
+
+    log_density: Array  # (R, T), 0 in steps that a run does not have
+    ratio: float  # total NIS over its degrees of freedom
+    failures: tuple[str, ...]  # of runs that failed
+
+
+class BeliefScorer:
+    """Scores a filter on trials under any belief; to be used in a ``with``, whose end kills what still works.
+
+    A filter that is not compiled keeps its processes from one setting to the next, with the modules that it imports.
+
+    Parameters
+    ----------
+    belief : that a fit begins with
+    timeout : seconds a trial of a filter that is not compiled
+    """
+
+    def __init__(
+        self, filter_: Filter, trials: Sequence[Trial], belief: Belief, jobs: int = -1, timeout: float | None = None
+    ) -> None:
+        self.filter, self.trials = filter_, list(trials)
+        self.settings, self.began = 0, time.monotonic()
+        self._told = self.began
+        # kernels release the GIL; other filters run in processes
+        self._pool = ThreadPoolExecutor(min(worker_count(jobs), len(self.trials)))
+        self._isolation = Isolation([filter_], belief, timeout)
+
+    def __enter__(self) -> BeliefScorer:
+        self._isolation.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._isolation.__exit__()
+        self._pool.shutdown(cancel_futures=True)
+
+    def compile(self) -> None:
+        """Compile the filter, so that its first setting takes no longer than others."""
+        compile_all([(self.filter, self.trials[0], self._isolation.belief)])
+
+    def __call__(self, belief: Belief) -> Scores:
+        """Return the scores of all runs.
+
+        Raises
+        ------
+        InputError
+            The filter reports no innovations, or needs what a trial does not have.
+        """
+        with one_blas_thread():
+            scores = list(self._pool.map(lambda trial: self._score(trial, belief), self.trials))
+        self.settings += 1
+        self._tell()
+        density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
+        failures = []
+        for row, trial, score in zip(density, self.trials, scores, strict=True):
+            row[: len(score.log_density)] = score.log_density
+            if score.failure:
+                failures.append(f"run {trial.run}, {score.failure}")
+        dof = sum(score.dof for score in scores)
+        ratio = sum(score.nis for score in scores) / dof if dof else np.nan
+        return Scores(density, ratio, tuple(failures))
+
+    def _score(self, trial: Trial, belief: Belief) -> RunScore:
+        [estimates] = self._isolation.run(trial, belief)
+        return score_of_run_by_innovations(trial, estimates)
+
+    def _tell(self) -> None:
+        """Print a line of progress, every few seconds."""
+        now = time.monotonic()
+        if now - self._told < EVERY:
+            return
+        self._told = now
+        say(
+            f"fitting {name_of(self.filter)}: {self.settings} settings on each of {len(self.trials)} runs, "
+            f"{now - self.began:.0f} s"
+        )
+
+
+class NoiseGroup(NamedTuple):
+    """Channels whose variances have one factor, such as ``Q.v``; ``name`` is what the user calls them."""
+
+    name: str
+    channels: tuple[str, ...]
+
+
+def noise_groups_of(text: str, belief: Belief) -> tuple[NoiseGroup, ...]:
+    """Groups as the option ``--groups`` has them: "Q,R", "Q.v,Q.omega,R" or "Q,R.u+R.v,R.d".
+
+    ``Q`` and ``R`` stand for all their channels with a noise. Channels that no group names stay as they are.
+
+    Raises
+    ------
+    InputError
+        An unknown channel, one that is named twice, or one whose noise is zero and stays so whatever its factor.
+    """
+    sigma, channels_by_name = sigma_by_channel(belief), dict[str, list[str]]()
+    for noise in ("Q", "R"):
+        members = [channel for channel in sigma if channel.startswith(noise)]
+        channels_by_name[noise] = [channel for channel in members if sigma[channel] > 0.0]
+        channels_by_name |= {channel: [channel] for channel in members}
+    groups, seen = [], set[str]()
+    for name in (part.strip() for part in text.split(",")):
+        channels: list[str] = []
+        for member in (part.strip() for part in name.split("+")):
+            if member not in channels_by_name:
+                raise InputError(f"--groups {text}: unknown noise '{member}'; there are {', '.join(channels_by_name)}")
+            if not any(sigma[channel] for channel in channels_by_name[member]):
+                raise InputError(
+                    f"--groups {text}: '{member}' is believed to be zero, which no factor changes; believe in a noise, "
+                    "or leave it out"
+                )
+            channels += channels_by_name[member]
+        for channel in channels:
+            if channel in seen:
+                raise InputError(f"--groups {text}: '{channel}' is named twice; it has one factor")
+            seen.add(channel)
+        groups.append(NoiseGroup(name, tuple(channels)))
+    return tuple(groups)
+
+
+def scaled(belief: Belief, groups: Sequence[NoiseGroup], log_factors: Array) -> Belief:
+    """The belief with the variances of each group times its factor; ``log_factors`` (groups,)."""
+    sigma = sigma_by_channel(belief)
+    for group, log_factor in zip(groups, log_factors, strict=True):
+        for channel in group.channels:
+            sigma[channel] *= float(np.exp(log_factor / 2.0))
+    return _with_sigma(belief, sigma)
+
+
+def rounded(belief: Belief) -> Belief:
+    """The belief with the digits that are written of its standard deviations."""
+    sigma = sigma_by_channel(belief)
+    for channel, value in sigma.items():
+        sigma[channel] = float(f"{value:.{DIGITS}g}")
+    return _with_sigma(belief, sigma)
+
+
+def sigma_by_channel(belief: Belief) -> dict[str, float]:
+    """Standard deviation of each channel, SI units and px."""
+    values = (belief.motion.sigma_v, belief.motion.sigma_omega, *belief.sensor.sigma)
+    names = (*(f"Q.{name}" for name in MOTION), *(f"R.{name}" for name in CHANNELS[belief.sensor.model]))
+    return dict(zip(names, values, strict=True))
+
+
+def _with_sigma(belief: Belief, sigma: dict[str, float]) -> Belief:
+    sigma_v, sigma_omega, *sensor_sigmas = sigma.values()
+    motion = belief.motion.model_copy(update={"sigma_v": sigma_v, "sigma_omega": sigma_omega})
+    return belief.model_copy(
+        update={"motion": motion, "sensor": belief.sensor.model_copy(update={"sigma": tuple(sensor_sigmas)})}
+    )

@@ -1,35 +1,54 @@
-"""Fit the noises that a filter believes in, and judge it before and after on runs that the fit has not seen."""
+"""Noises that a filter should believe in: fitted, judged on runs that the fit has not seen, and told in words."""
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.filter_declarations import name_of
-from consistency.bench.filters.resolve_filters import resolve_filters
+from consistency.bench.filters.run_filter import resolve_filters
 from consistency.bench.protocols import Filter
-from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.scenario import Belief, Scenario, load_scenario
-from consistency.bench.store.recorded_log import Log
-from consistency.bench.tuning.fit_and_verdict_trials import parts_of
-from consistency.bench.tuning.innovation_likelihood import BeliefScorer, require_scorable
-from consistency.bench.tuning.noise_factor_fit import FactorFit, fit_log_factors
-from consistency.bench.tuning.noise_groups import NoiseGroup, noise_groups_of, rounded, scaled
-from consistency.bench.tuning.tuning_result import Factor, Setting, Tuning
-from consistency.referee.diagnostics.verdict.answers import Settings
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.bench.runs.montecarlo import require_counts, run_log, run_trials
+from consistency.bench.runs.results_to_records import analyse
+from consistency.bench.runs.run_outcome import Simulated
+from consistency.bench.scenario import Belief, Scenario, load_scenario, scenario_text, toml_text
+from consistency.bench.scenario.toml_tables import SIGMA_UNITS
+from consistency.bench.store.parquet import write_tables
+from consistency.bench.store.recorded_log import Log, sensor_text
+from consistency.bench.store.results import Tables
+from consistency.bench.tuning.noise_factor_fit import (
+    LIMIT,
+    BeliefScorer,
+    FactorFit,
+    NoiseGroup,
+    fit_log_factors,
+    noise_groups_of,
+    require_scorable,
+    rounded,
+    scaled,
+    sigma_by_channel,
+)
+from consistency.bench.types import Trial
+from consistency.referee.defaults import CONFIDENCE
+from consistency.referee.diagnostics.verdict.parts import Interval, Settings
+from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
+from consistency.referee.diagnostics.words.numbers import short
 from consistency.referee.errors import InputError
+from consistency.referee.system.folders import manifest_of
 from consistency.referee.system.progress import quiet
 from consistency.referee.types import Array
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for
 MOST_TOLERATED = 1.1  # ratio of true to stated covariance: what a verdict may excuse as the uncertainty of a fit
+Judging = Callable[[Filter, Belief, int, float | None], Tables]  # with so many jobs, and seconds a trial
+KIND = "tuning"
 
 
 def tune(
@@ -132,3 +151,315 @@ def tolerant(settings: Settings, interval: Array) -> Settings:
 def _factor(group: NoiseGroup, log_factor: float, interval: Array, edge: int) -> Factor:
     value, (low, high) = float(np.exp(log_factor)), np.exp(interval)
     return Factor(group, value, Interval(value, float(low), float(high)), edge)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Two parts of one world that share no noise."""
+
+    world: Scenario | Log
+    trials: list[Trial]  # of the fit
+    on_fresh: Judging  # results on the other part
+    fitted_on: str  # in words
+    judged_on: str
+    again: str  # options by which ``consistency run`` judges again; empty where it cannot
+
+    @property
+    def belief(self) -> Belief:
+        """Belief before the fit."""
+        return self.world.belief
+
+
+def parts_of(world: Scenario | Log, runs: int, seed: int) -> Parts:
+    """So many runs of a scenario and as many fresh ones; or the first half of a log and its second.
+
+    A log of one run is divided in the middle of its steps. The second part begins with an empty map.
+
+    Raises
+    ------
+    InputError
+        A number out of its range, nothing in view, or a log that cannot be divided.
+    """
+    return _parts_of_log(world) if isinstance(world, Log) else _parts_of_scenario(world, runs, seed)
+
+
+def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
+    require_counts(runs, seed)
+    fit_seed, verdict_seed = (int(state) for state in np.random.SeedSequence(seed).generate_state(2))
+    simulated = Simulated(scenario, fit_seed)
+    trials = [simulated(run) for run in range(runs)]
+
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
+        return run_trials(with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
+
+    runs_text = _runs(runs)
+    judged_on = f"{runs_text} that the fit has not seen"
+    return Parts(scenario, trials, on_fresh, runs_text, judged_on, f"--runs {runs} --seed {verdict_seed}")
+
+
+def _parts_of_log(log: Log) -> Parts:
+    trials = log.trials
+    if len(trials) > 1:
+        fitted_runs = (len(trials) + 1) // 2
+        fit_trials, verdict_trials = trials[:fitted_runs], trials[fitted_runs:]
+        fitted_on, judged_on = f"the first {_runs(fitted_runs)}", f"the other {len(verdict_trials)}"
+    else:
+        [only_trial] = trials
+        if log.belief.sensor.model == "linear":
+            raise InputError(f"--log {log.name}: one run of a linear world cannot be divided; give two or more")
+        middle_step = only_trial.steps // 2
+        if middle_step < 1:
+            raise InputError(f"--log {log.name}: one run of one step cannot be divided; give a longer one")
+        fit_trials = [part_of(only_trial, 0, middle_step)]
+        verdict_trials = [part_of(only_trial, middle_step, only_trial.steps)]
+        fitted_on = f"the first {middle_step} steps"
+        judged_on = f"the other {only_trial.steps - middle_step}, which begin with an empty map"
+
+    def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
+        return run_log(replace(log, trials=verdict_trials, belief=belief), [filter_], jobs, timeout)
+
+    return Parts(log, fit_trials, on_fresh, fitted_on, judged_on, "")
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"
+
+
+def part_of(trial: Trial, start: int, end: int) -> Trial:
+    """Steps ``start`` + 1 to ``end`` as a trial of its own: it begins at the true pose, or at the origin without."""
+    rows = slice(trial.first[start], trial.first[end])
+    truth = source = None
+    pose = trial.start if start == 0 else np.zeros(3)
+    if trial.truth is not None:
+        truth = trial.truth[start : end + 1]
+        pose = trial.start if start == 0 else truth[0]
+    if trial.source is not None:
+        source = trial.source[rows]
+    return replace(
+        trial,
+        start=pose,
+        controls=trial.controls[start:end],
+        first=trial.first[start : end + 1] - trial.first[start],
+        landmark=trial.landmark[rows],
+        z=trial.z[rows],
+        truth=truth,
+        source=source,
+    )
+
+
+def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
+    """The scenario with another belief."""
+    return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Factor on the variances of a group of noises, with a 95 % interval.
+
+    The interval is open, with an end of 0 or infinity, on a side on which the data do not bound the factor.
+    ``edge`` is -1 or 1 where the factor lies at the lower or upper limit of what is tried, which is then no estimate.
+    """
+
+    group: NoiseGroup
+    value: float
+    interval: Interval
+    edge: int = 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A fit, the belief that it leads to, and the verdict on it."""
+
+    factors: tuple[Factor, ...]
+    belief: Belief
+    verdict: Verdict
+    settings: int  # that were tried
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """Result of a fit, with the verdicts before and after it."""
+
+    filter: str
+    parts: Parts
+    before: Verdict  # with the belief as it was, on the runs that are judged
+    chosen: Setting
+    seconds: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """After the fit, on runs that it has not seen."""
+        return self.chosen.verdict
+
+    @property
+    def consistent(self) -> bool:
+        return self.verdict.consistent
+
+    @property
+    def has_fault(self) -> bool:
+        """Whether a fault is found after the fit; an undecided verdict has none."""
+        return self.verdict.status not in ("consistent", "undecided")
+
+    @property
+    def factors(self) -> tuple[Factor, ...]:
+        return self.chosen.factors
+
+    @property
+    def belief(self) -> Belief:
+        """With the noises of the chosen setting."""
+        return self.chosen.belief
+
+    def __str__(self) -> str:
+        return "\n".join(tuning_lines(self))
+
+
+def tuning_lines(tuning: Tuning, out: Path | None = None) -> list[str]:
+    """What to print beside the table of verdicts; ``out`` is the folder that was written."""
+    parts, chosen = tuning.parts, tuning.chosen
+    lines = [
+        f"{tuning.filter} on {parts.world.name}: fitted by the likelihood of the innovations on {parts.fitted_on}, "
+        f"judged on {parts.judged_on} ({chosen.settings} settings, {tuning.seconds:.0f} s)",
+        *_factor_lines(chosen, parts.belief),
+        f"before: {tuning.before.reasons[0]}{_power(tuning.before)}",
+        f"after: {chosen.verdict.reasons[0]}{_power(chosen.verdict)}",
+    ]
+    if tuning.has_fault:
+        names = ", ".join(factor.group.name for factor in chosen.factors)
+        chance = f"one of {1.0 / chosen.verdict.settings.false_alarm:.3g} verdicts on a right filter"
+        lines.append(
+            f"the size of {names} is not all that is wrong, unless the fault was found by chance, as in {chance}; "
+            "docs/tuning.md says what else may be"
+        )
+    lines += ["", noise_table(tuning).rstrip()]
+    if out is not None:
+        lines += ["", f"{out} has {', '.join(files(tuning))}{_next(tuning, out)}"]
+    return lines
+
+
+def _factor_lines(setting: Setting, before: Belief) -> list[str]:
+    sigma_before, sigma_after = sigma_by_channel(before), sigma_by_channel(setting.belief)
+    rows = []
+    for factor in setting.factors:
+        changes = [f"{name} {sigma_before[name]:.4g} -> {sigma_after[name]:.4g}" for name in factor.group.channels]
+        rows.append(f"  {factor.group.name} {factor_text(factor)} (sigma: {', '.join(changes)})")
+    return rows
+
+
+def factor_text(factor: Factor) -> str:
+    """x1.02 [0.97, 1.07], of variances; "at most" or "at least" where the data bound it on one side alone."""
+    low, high = factor.interval.low, factor.interval.high
+    factor_value, confidence = f"x{short(factor.value)}", f"with {100.0 * CONFIDENCE:g} %"
+    bound_of_factor = ""
+    if np.isfinite(high):
+        bound_of_factor = f"at most x{short(high)}"
+    elif low > 0.0:
+        bound_of_factor = f"at least x{short(low)}"
+    if factor.edge:
+        limit = np.exp(factor.edge * LIMIT)
+        return f"is at the limit of what is tried, x{limit:g}; {bound_of_factor or 'not known'} {confidence}"
+    if low > 0.0 and np.isfinite(high):
+        return f"{factor_value} [{short(low)}, {short(high)}]"
+    if bound_of_factor:
+        return f"{factor_value}, {bound_of_factor} {confidence}"
+    return f"{factor_value}, which these data do not bound"
+
+
+def _power(verdict: Verdict) -> str:
+    if verdict.scale is None or not np.isfinite(verdict.scale.detectable):
+        return ""
+    ratio = short(verdict.scale.detectable)
+    return f" (a covariance too small by x{ratio} would be found with power {verdict.settings.power:g})"
+
+
+def noise_table(tuning: Tuning) -> str:
+    """The believed noises as TOML to paste: into a scenario, or into ``sensor.toml`` of a log."""
+    belief = tuning.belief
+    motion = {"sigma_v": belief.motion.sigma_v, "sigma_omega": belief.motion.sigma_omega}
+    sigma = {f"sigma{SIGMA_UNITS[belief.sensor.model]}": list(belief.sensor.sigma)}
+    if isinstance(tuning.parts.world, Log):
+        return toml_text(sigma | {"motion": motion})
+    return toml_text({"belief": {"motion": motion, "sensor": sigma}})
+
+
+def files(tuning: Tuning) -> dict[str, str]:
+    """Text of the tuned world, or sensor, by name of its file."""
+    world, belief = tuning.parts.world, tuning.belief
+    comment = (
+        f"{tuning.filter} tuned by the likelihood of the innovations on {tuning.parts.fitted_on}: "
+        f"{tuning.verdict.status}"
+    )
+    if isinstance(world, Log):
+        return {"sensor.toml": f"# {comment}\n{sensor_text(Path(world.name), belief)}"}
+    name = f"{world.name}-tuned"
+    return {f"{name}.toml": scenario_text(with_belief(world, belief, name), comment)}
+
+
+def _next(tuning: Tuning, out: Path) -> str:
+    world, run = tuning.parts.world, "consistency run"
+    if isinstance(world, Log):
+        use = f"{run} --log {world.name} --filter {tuning.filter} --out results"
+        return f"; put it in the place of {Path(world.name) / 'sensor.toml'}, and run: {use}"
+    [name] = files(tuning)
+    return f"; judged again by: {run} {out / name} --filter {tuning.filter} {tuning.parts.again} --out results"
+
+
+def tuning_verdicts(tuning: Tuning) -> dict[str, Verdict]:
+    """Rows of the table of verdicts, by name."""
+    return {f"{tuning.filter}, as believed": tuning.before, f"{tuning.filter}, tuned": tuning.verdict}
+
+
+def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
+    """Write the files of a fit, with its outcome, as a folder that appears whole."""
+    tuning_json = json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False) + "\n"
+    texts_by_file = files(tuning) | {"tuning.json": tuning_json}
+
+    def contents(at: Path) -> None:
+        for name, text in texts_by_file.items():
+            (at / name).write_text(text, encoding="utf-8")
+
+    world = tuning.parts.world
+    origin: dict[str, Any] = {"scenario": world.name}
+    if isinstance(world, Log):
+        origin = {"log": world.name, "log_sha256": world.sha256}
+    manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
+    write_tables(out, {}, manifest, contents, overwrite)
+
+
+def tuning_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
+    """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
+    data = {
+        "filter": tuning.filter,
+        "world": tuning.parts.world.name,
+        "fitted_on": tuning.parts.fitted_on,
+        "judged_on": tuning.parts.judged_on,
+        "before": _verdict_data(tuning.before),
+        "chosen": _setting_data(tuning.chosen),
+        "consistent": tuning.consistent,
+        "seconds": tuning.seconds,
+        "out": None if out is None else str(out),
+    }
+    return dict(plain(data))
+
+
+def _setting_data(setting: Setting) -> Mapping[str, Any]:
+    factors = []
+    for factor in setting.factors:
+        group, interval = factor.group, factor.interval
+        row = {"group": group.name, "channels": list(group.channels), "factor": factor.value}
+        factors.append(row | {"low": interval.low, "high": interval.high, "edge": factor.edge})
+    return {
+        "factors": factors,
+        "sigma": sigma_by_channel(setting.belief),
+        "settings": setting.settings,
+        "verdict": _verdict_data(setting.verdict),
+    }
+
+
+def _verdict_data(verdict: Verdict) -> Mapping[str, Any]:
+    return {
+        "status": verdict.status,
+        "reasons": list(verdict.reasons),
+        "runs": verdict.runs,
+        "statistics": plain(verdict.statistics),
+        "detectable": None if verdict.scale is None else verdict.scale.detectable,
+    }

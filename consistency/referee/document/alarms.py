@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.monitoring.gate_ratios import RARE, GateRatios
-from consistency.referee.diagnostics.monitoring.monitor import CAVEAT, Alarm, Monitor, accepted_scales
+from consistency.referee.diagnostics.monitor import CAVEAT, RARE, Alarm, GateRatios, Monitor, accepted_scales
 from consistency.referee.diagnostics.verdict.verdict import CLOCK, MICROSECOND
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 

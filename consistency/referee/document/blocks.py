@@ -1,15 +1,36 @@
-"""What a document is made of: text, tables, lists of facts, figures."""
+"""What a document is made of: text, tables, lists of facts, figures.
+
+Numbers as words and colours, the same in every format.
+
+Colours are those of Okabe & Ito (2008). Each style has a dash pattern and a marker of its own as well, so that a grey
+print still reads.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from consistency.referee.document.colours import Look
+from consistency.referee.diagnostics.words.numbers import short, with_subject
+
+INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
+SMALLEST = 1e-6  # p value below which digits say nothing
+TRUTH, ODOMETRY, BAND = "#000000", "#7f7f7f", "#d9d9d9"
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# lengths in points, drawn and left out; 5 patterns and 6 colours repeat together only after 30
+DASHES: tuple[tuple[float, ...], ...] = (
+    (),
+    (5.0, 2.0),
+    (1.5, 1.5),
+    (7.0, 2.0, 1.5, 2.0),
+    (3.0, 1.5, 1.0, 1.5, 1.0, 1.5),
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # Matplotlib's names
+SIGMAS = 2.0  # stated standard deviations from 0 to the bounds of an error that are drawn
 
 
 @dataclass(frozen=True)
@@ -252,3 +273,147 @@ class Document:
 def table(columns: tuple[Column, ...], rows: Sequence[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:
     """Table of rows without groups."""
     return Table(columns, (("", tuple(rows)),), label, **options)  # type: ignore[arg-type]
+
+
+NONE = Quantity(None)
+
+
+class Signs(NamedTuple):
+    """What stands for a number that is none, a factor, infinity, and an end of an interval that is not known."""
+
+    none: str
+    factor: str
+    infinite: str
+    unknown: str
+
+
+PLAIN = Signs("-", "x", "inf", "nan")  # of a terminal and of text
+PRINTED = Signs("–", "×", "∞", "–")
+
+
+def written(cell: Cell, signs: Signs = PRINTED) -> str:
+    """The text of a cell."""
+    if isinstance(cell, str):
+        return cell
+    if isinstance(cell, Reason):
+        return cell.sentence
+    if isinstance(cell, Answer):
+        return f"{cell.mark} {cell.text}"
+    if isinstance(cell, Status):
+        return cell.text + cell.note
+    return _quantity(cell, signs) if isinstance(cell, Quantity) else cell.text
+
+
+def _quantity(q: Quantity, signs: Signs) -> str:
+    if q.is_empty or q.value is None:
+        return signs.none
+    text = f"{signs.factor * q.is_factor}{_digits(q.value, q.digits, signs)}{q.unit}"
+    if q.interval is not None:
+        low, high = q.interval
+        if np.isfinite(q.limit) and low > 1.0 and high >= q.limit * low:
+            return f"at least {signs.factor}{_digits(low, q.digits, signs)}{q.unit}"
+        known = np.isinf(q.limit) or high < q.limit * low
+        text += f" [{', '.join(_digits(end, q.digits, signs) for end in (low, high)) if known else 'unknown'}]"
+    return f"({text})" if q.is_aside else text
+
+
+def _digits(value: float, digits: str, signs: Signs) -> str:
+    if np.isnan(value):
+        return signs.unknown
+    if np.isinf(value):
+        return signs.infinite
+    if digits:
+        return format(float(value), digits)
+    return short(value) if value else "0"
+
+
+def number(value: Any, digits: str) -> str:
+    """A number with digits as a format says, or a dash where there is none."""
+    return written(Quantity(value, digits=digits))
+
+
+def brief(value: float | None) -> str:
+    """A number in three digits, a dash where there is none."""
+    return written(Quantity(value))
+
+
+def p_cell(p: float) -> str:
+    """A p value as a table has it."""
+    return "< 1e-6" if p < SMALLEST else f"{p:.2g}"
+
+
+def unbroken(text: str) -> str:
+    """The text, in which no line ends inside an interval or before %."""
+    return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace(" %", "\u00a0%"))
+
+
+# --- blocks ------------------------------------------------------------------------------------------
+
+
+def fragment(*blocks: Block) -> str:
+    """Lines of all blocks; figures and settings are left out."""
+    return "\n".join(line for block in blocks for line in _lines(block))
+
+
+def _lines(block: Block) -> list[str]:
+    match block:
+        case Reasons():
+            lines = []
+            for entry in block.entries:
+                lines += [with_subject(entry.name, entry.sentence), *(f"  - {other}" for other in entry.others)]
+            return lines
+        case Facts():
+            width = max(len(name) for name, _ in block.rows)
+            return [f"  {name:<{width}}  {value}" for name, value in block.rows]
+        case Table():
+            return _table(block)
+        case Bullets():
+            return [f"  - {text}" for text in block.texts]
+        case Text() | Heading():
+            return [block.text]
+        case _:
+            return []
+
+
+def _table(table: Table) -> list[str]:
+    """Rows in columns; what did not pass is said below its row."""
+    rows = [[column.head for column in table.columns]]
+    below: list[list[str]] = [[]]
+    for cells in table.rows:
+        rows.append([written(cell, PLAIN) for cell in cells if not isinstance(cell, Reason)])
+        failed = [cell for cell in cells if isinstance(cell, Reason) and not cell.has_passed]
+        below.append([f"    {with_subject(cell.name, cell.sentence)}" for cell in failed])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=False)]
+    lines = []
+    for row, more in zip(rows, below, strict=True):
+        lines += ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip(), *more]
+    return lines
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a mark or the entry of a legend looks; lengths in points."""
+
+    colour: str
+    dash: tuple[float, ...] = ()  # empty: solid
+    marker: str = "o"
+    width: float = 1.2
+    size: float = 4.2  # of a marker
+    alpha: float = 1.0
+    edge: str = ""  # colour of a marker's outline; empty: none
+
+
+EXPECTED = Look("#555555", width=0.8)
+LIMIT = Look("#333333", (4.0, 3.0), width=0.9)
+ZERO = Look("#555555", width=0.5)
+ACCEPTED, REJECTED = Look(COLOURS[0], (), "o"), Look(COLOURS[1], (), "X")
+
+
+def style(index: int) -> Look:
+    """Look of the filter with this number; the same number always looks the same."""
+    return Look(COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)], MARKERS[index % len(MARKERS)])
+
+
+def solid(look: Look) -> Look:
+    """A copy of this look without dashes, for panels of one filter each."""
+    return replace(look, dash=())

@@ -1,10 +1,14 @@
-"""A stated covariance corrected by factors and floors, and judged on runs that chose nothing."""
+"""A stated covariance corrected by factors and floors, judged on runs that chose nothing.
+
+What was found is told in sentences, tables and numbers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +21,12 @@ from consistency.referee.diagnostics.questions.scale import ratio_interval, run_
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
+from consistency.referee.diagnostics.words.numbers import plural, short
+from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named
+from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named, shown
+from consistency.referee.fit_covariance.estimation import log_densities, mean_over_runs
 from consistency.referee.fit_covariance.factors import (
     FactorBlock,
     Factors,
@@ -30,8 +37,6 @@ from consistency.referee.fit_covariance.factors import (
     stated_errors,
     steps_of_runs,
 )
-from consistency.referee.fit_covariance.intervals import mean_over_runs
-from consistency.referee.fit_covariance.likelihood import log_densities
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
@@ -39,6 +44,7 @@ from consistency.referee.verdicts.judge_sources import judge_all, source_of
 LEVELS = (0.68, 0.95, 0.99)
 ByGroup = tuple[Factors, ...]  # of each group, and last of all steps
 FEW = 30  # runs; with fewer what the uncertainty of the factors adds to a ratio is printed
+UNITS = {"position": " m", "attitude": " rad", "velocity": " m/s"}
 
 
 @dataclass(frozen=True)
@@ -132,13 +138,12 @@ class Correction:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.page import draw_correction
+        from consistency.referee.fit_covariance.fit_files import draw_correction
         from consistency.referee.pages.write_pages import plotted
 
         return plotted(partial(draw_correction, self), path)
 
     def __repr__(self) -> str:
-        from consistency.referee.fit_covariance.correction_text import correction_sentence  # of this class
 
         return f"<Correction {self.name}: {correction_sentence(self)}>"
 
@@ -233,7 +238,7 @@ def require_runs(record: Record) -> None:
         raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
     runs = int(np.isfinite(record.nees).any(axis=1).sum())
     if runs == 1:
-        from consistency.referee.diagnostics.planning.single_log import FEWEST
+        from consistency.referee.diagnostics.questions.planning import FEWEST
 
         raise InputError(
             f"{record.name}: one log has no other to judge its factors by; give several runs, or cut it with --split "
@@ -379,3 +384,134 @@ def average(values: Array) -> float:
     """Mean over runs of the mean over the steps of each, (runs, steps), NaN where there is none."""
     means, counts = run_means(values)
     return float(means[counts > 0].mean())
+
+
+def correction_sentence(found: Correction) -> str:
+    """The end that was reached, the ratios, and how they were found."""
+    before, after = found.before.ratio, found.after.ratio
+    how = f"{plural(len(found.judged), found.unit)}, each judged by the factors of the others"
+    if found.held_out != IN_TURN:
+        how = f"fitted on {plural(len(found.fitted), found.unit)}, judged on {len(found.judged)} others"
+    parts = [f"{found.status} after: held-out covariance ratio {shown(before)} before and {shown(after)} after", how]
+    if found.status == "undecided":
+        decided_by = (
+            f"about {plural(found.needed, found.unit)} would decide" if found.needed else found.verdict.reasons[0]
+        )
+        parts.append(decided_by)
+    if found.status == "inconsistent":
+        parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
+    elif not found.is_needed:
+        parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
+    return "; ".join(parts)
+
+
+def correction_document(found: Correction) -> Document:
+    """Sentence, factors, held-out figures, and limits; numbers as data."""
+    opening: list[Block] = [Text(f"{found.name}: {correction_sentence(found)}"), _factors(found), _figures(found)]
+    opening += map(Text, correction_lines(found))
+    return Document(
+        f"{found.name}: correction of the stated covariance", "", (), tuple(opening), data_of_correction(found)
+    )
+
+
+def _factors(found: Correction) -> Table:
+    """A row for each block, in each group; columns of groups and floors where there are some."""
+    fits = found.shown
+    has_floors = any(each.high > 0.0 for fit in fits.values() for each in fit.floor)
+    is_shown = (len(found.fits) > 1, True, True, True, True, has_floors)
+    factor_heads = Column("factor on variances"), Column("on sigmas", number=True)
+    columns = (Column("group"), Column("block"), Column("components"), *factor_heads, Column("floor, as a sigma"))
+    rows = []
+    for group, fit in fits.items():
+        for block, factor, floor in zip(found.blocks, fit.factor, fit.floor, strict=True):
+            names = " ".join(found.axes[i] for i in block.places)
+            on_sigmas = f"x{short(float(np.sqrt(factor.value)))}"
+            row = (group, block.name, names, shown(factor), on_sigmas, _sigma(floor, block.name))
+            rows.append(tuple(compress(row, is_shown)))
+    return table(tuple(compress(columns, is_shown)), rows, "Factors of each block", style="plain")
+
+
+def _sigma(floor: Interval, block: str) -> str:
+    """A floor as a standard deviation, with its unit where that is known."""
+    unit = UNITS.get(block, "")
+    value, low, high = np.sqrt(floor)
+    return f"{value:.2g}{unit} [{low:.2g}, {high:.2g}]"
+
+
+def _figures(found: Correction) -> Table:
+    columns = (Column("held-out"), Column("stated"), Column("corrected"), Column("expected", number=True))
+    before, after = found.before, found.after
+    rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
+    for level, stated, corrected in zip(LEVELS, before.covered(LEVELS), after.covered(LEVELS), strict=True):
+        rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
+    return table(columns, rows, "Held-out errors beside the stated and the corrected covariance", style="plain")
+
+
+def correction_lines(found: Correction) -> Iterator[str]:
+    """Gain of the log score, what the uncertainty of the factors does, and limits."""
+    gain = found.gain
+    ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
+    yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
+    if len(found.fitted) < FEW and np.isfinite(found.excess):
+        without = found.after.ratio.value / found.excess
+        yield (
+            f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "
+            f"held-out ratio; without it the ratio is {short(without)}"
+        )
+    if found.verdict.status != found.after.verdict.status:
+        yield (
+            f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "
+            "their uncertainty is taken in"
+        )
+    if len(found.fits) > 1 and not any(fit.factors.floor.any() for fit in found.shown.values()):
+        yield "floors are 0 in all groups"
+    else:
+        yield from (note for fit in found.shown.values() for note in fit.notes)
+    yield "the factors hold for data like these; those of new conditions may be others"
+
+
+def data_of_correction(found: Correction) -> dict[str, Any]:
+    """Everything as plain data, as correction.toml and --json have it."""
+    groups = found.before.record.groups
+    return dict(
+        plain({
+            "name": found.name,
+            "status": found.status,
+            "sentence": correction_sentence(found),
+            "held_out": found.held_out,
+            "fitted_runs": found.fitted,
+            "judged_runs": found.judged,
+            "needed_runs": found.needed,
+            "convention": found.before.record.convention,
+            "excess": found.excess,
+            "log_score_gain": found.gain,
+            "by": groups.column if groups is not None else None,
+            "edges": groups.edges if groups is not None else None,
+            "blocks": [_block(found, group, b) for group in found.shown for b in range(len(found.blocks))],
+            "stated": _held_out(found.before),
+            "corrected": _held_out(found.after),
+            "notes": [note for fit in found.shown.values() for note in fit.notes],
+            "referee": found.verdict.statistics,
+        })
+    )  # fmt: skip
+
+
+def _block(found: Correction, group: str, b: int) -> dict[str, Any]:
+    """Factor and floor of a block, in a group where there are groups."""
+    block, fit = found.blocks[b], found.fits[group]
+    return {
+        "group": group or None,
+        "name": block.name,
+        "components": [found.axes[i] for i in block.places],
+        "factor": fit.factors.factor[b],
+        "factor_interval": fit.factor[b][1:],
+        "floor": fit.factors.floor[b],
+        "floor_interval": fit.floor[b][1:],
+        "degrees_of_freedom": fit.dof[b],
+    }
+
+
+def _held_out(one: HeldOut) -> dict[str, Any]:
+    names = (f"inside_{100 * level:.0f}" for level in LEVELS)
+    coverage = dict(zip(names, one.covered(LEVELS), strict=True))
+    return {"ratio": one.ratio.value, "ratio_interval": one.ratio[1:], **coverage, "log_score": one.scores.mean()}

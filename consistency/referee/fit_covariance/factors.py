@@ -16,16 +16,21 @@ import numpy as np
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.intervals import (
+from consistency.referee.fit_covariance.estimation import (
     TAIL,
+    Score,
     chance_of_one,
     dof_of_ratio,
     effective_number,
     floor_interval,
     interval_of_ratio,
+    log_densities,
+    maximise,
     mean_over_runs,
+    nonnegative,
+    score_of,
+    solved,
 )
-from consistency.referee.fit_covariance.likelihood import Score, log_densities, maximise, nonnegative, score_of, solved
 from consistency.referee.types import Array, Indices
 
 KINDS = {

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.geometry.lie_groups import inverse, log, matrices, vectors
-from consistency.referee.readers.windows import Relative, relative_of, windows
+from consistency.referee.geometry import inverse, log, matrices, vectors
+from consistency.referee.readers.runs_to_record import Relative, relative_of, windows
 from consistency.referee.types import Array, Indices
 
 PIECES = 20  # of a window: sums over them are independent of the rate of the file, and as good as integrals

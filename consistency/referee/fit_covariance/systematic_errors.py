@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.fit_covariance.intervals import student
+from consistency.referee.fit_covariance.estimation import student
 from consistency.referee.fit_covariance.motion_windows import (
     BLOCKS,
     DriveWindows,
@@ -21,7 +21,7 @@ from consistency.referee.fit_covariance.motion_windows import (
     turn_per_way,
     ways,
 )
-from consistency.referee.geometry.lie_groups import adjoint, inverse
+from consistency.referee.geometry import adjoint, inverse
 from consistency.referee.types import Array
 
 ROUNDS = 2  # of Gauss and Newton from nothing; from a mean that is nearly right one is enough

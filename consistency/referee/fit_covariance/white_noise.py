@@ -11,8 +11,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.intervals import interval_of
-from consistency.referee.fit_covariance.likelihood import maximise, nees_of, score_of
+from consistency.referee.fit_covariance.estimation import interval_of, maximise, nees_of, score_of
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,

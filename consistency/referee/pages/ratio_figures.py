@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN
-from consistency.referee.document.blocks import Block, Cell, Column, Details, Figure, Quantity, table
-from consistency.referee.document.colours import EXPECTED, solid
-from consistency.referee.pages.judged_estimators import Judged
-from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+from consistency.referee.document.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
+from consistency.referee.pages.verdicts import Judged
+from consistency.referee.show.figures import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +23,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
-from consistency.referee.document.colours import ACCEPTED, BAND, REJECTED, Look
+from consistency.referee.document.blocks import ACCEPTED, BAND, REJECTED, Look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

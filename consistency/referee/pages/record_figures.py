@@ -1,41 +1,48 @@
 """Figures of one estimator: errors with their bounds, NEES, trajectory, coverage, innovations.
 
+The NIS over time.
+
 Where runs have one step, as those of a factor or a calibration, the runs stand along the axis, each a point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import of_both
+from consistency.referee.diagnostics.monitor import GateRatios
+from consistency.referee.diagnostics.questions.uncertain_truth import of_both
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import BAND, EXPECTED, LIMIT, SIGMAS, ZERO, Look, solid, style
+from consistency.referee.document.blocks import BAND, EXPECTED, LIMIT, SIGMAS, TRUTH, ZERO, Figure, Look, solid, style
 from consistency.referee.errors import InputError
-from consistency.referee.pages.judged_estimators import Clock, time_axis_of, wide
-from consistency.referee.pages.trajectory import shown_run, trajectory_panel
-from consistency.referee.show.matplotlib_style import (
+from consistency.referee.geometry import CHARTS
+from consistency.referee.pages.verdicts import Clock, time_axis_of, wide
+from consistency.referee.show.figures import (
     WIDTH,
     add_legend,
     band,
     canvas,
     curve,
+    dots,
     edges,
     log_axis,
+    make_map,
     panel_legend,
+    path,
     points,
     rows_of,
     stroke,
 )
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
+from consistency.referee.verdicts.monitor_sources import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,8 +61,19 @@ LEAST_REACH = 3.0  # sigma, from 0 to the ends of an axis
 JOINT = Look("#333333", width=1.4)
 EACH_RUN = replace(style(0), size=2.0, alpha=0.7)
 WORST = replace(solid(style(1)), size=3.5)
-
 Paint = Callable[["Axes"], None]
+IN_WORLD = ("so2", "so3", "so3-body", "vector", *CHARTS)  # errors whose position is about the axes of the world
+NAMES = "xyz"
+MOST = 5  # ellipses
+SHARE = 0.95  # of a right estimator's errors in a step that lie inside its ellipse
+CORNERS = 73
+TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
+ELLIPSE, AT = replace(style(1), dash=(), width=0.9), Look(TRUTH, marker="X", size=5.0)
+HEIGHT = 3.6  # inches
+LONG = 2000  # test ratios drawn of a sensor
+POINTS = 600  # at most, of the NIS: few enough to see a change among them
+EACH_STEP = replace(style(0), size=1.8, alpha=0.7)
+FAULT = replace(style(1), dash=(), width=1.1)
 
 
 @dataclass(frozen=True)
@@ -472,3 +490,160 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
         f"95 %.{'' if judged else ' Reported, not judged: no optimal gain is declared.'}{clock.note}"
     )
     return Picture("Innovations", caption, (paint,), height=1.6)
+
+
+def shown_run(record: Record) -> int:
+    """Row of the run that is drawn: the first that reaches furthest."""
+    assert record.error is not None
+    return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
+
+
+def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | None:
+    """Caption, and what draws the shown run on axes; None where positions are not known.
+
+    It shows the two axes over which the path reaches furthest.
+    """
+    if record.path is None or record.error is None or record.window is not None:
+        return None
+    row = shown_run(record)
+    true, estimated = record.path[row, :, 0], record.path[row, :, 1]
+    known = np.isfinite(record.path[row]).all(axis=(1, 2))
+    if known.sum() < 2 or sum(axis in record.axes for axis in NAMES) < 2:
+        return None
+    pair = furthest(record, np.ptp(true[known], axis=0))
+    steps = _worst(record, row) if record.convention in IN_WORLD else np.empty(0, np.int64)
+
+    def paint(axes: Axes) -> None:
+        path(axes, true[:, pair], TRUE, "truth")
+        path(axes, estimated[:, pair], ESTIMATED, "estimate")
+        label = "95 % ellipse"
+        for outline in ellipses_at(record, row, steps, pair):
+            path(axes, outline, ELLIPSE, label)
+            label = ""
+        if len(steps):
+            axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
+        x, y = (record.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
+        axes.set(xlabel=f"{x} (m)", ylabel=f"{y} (m)")
+        make_map(axes)
+
+    caption = f"Trajectory of {record.unit} {record.run_numbers[row]}, true and estimated."
+    if len(steps):
+        where = ", ".join(str(step + 1) for step in sorted(steps))
+        caption += (
+            " Ellipses: where the truth lies with 95 % by the stated covariance, in the steps whose errors are "
+            f"largest against it ({where}); crosses are the truth there."
+        )
+    elif record.convention not in IN_WORLD:
+        caption += " No ellipses: the stated covariance is not about the axes of the world."
+    return caption, paint
+
+
+def furthest(record: Record, reach: Array) -> list[int]:
+    """Two of the position's axes that are judged, with the largest product of their reach (3,); else the first."""
+    judged = [i for i, name in enumerate(NAMES) if name in record.axes]
+    return list(max(itertools.combinations(judged, 2), key=lambda two: float(np.prod(reach[list(two)]))))
+
+
+def ellipses_at(record: Record, row: int, steps: Indices, pair: Sequence[int]) -> list[Array]:
+    """Outlines (corners, 2) of the 95 % regions of one run in some steps, about the estimates."""
+    if not len(steps):
+        return []
+    assert record.path is not None
+    assert record.covariance is not None
+    index = [list(record.axes).index(NAMES[axis]) for axis in pair]
+    P = np.asarray(record.covariance[row], float)[steps][:, index][:, :, index]
+    centres = record.path[row, steps, 1][:, list(pair)]
+    return [ellipse(centre, own) for centre, own in zip(centres, P, strict=True)]
+
+
+def ellipse(centre: Array, P: Array) -> Array:
+    """Outline (corners, 2) of the region that holds a share of 95 % about ``centre`` (2,) with covariance P (2, 2)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+    circle = np.sqrt(float(distributions.chi2.ppf(SHARE, 2))) * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(centre + circle @ np.linalg.cholesky(P).T)
+
+
+def _worst(record: Record, row: int) -> Indices:
+    """Steps of the largest NEES, at most five, and apart from each other by a twentieth of the run."""
+    if record.nees is None:
+        return np.empty(0, np.int64)
+    nees = np.where(np.isfinite(record.nees[row]), record.nees[row], -1.0)
+    apart, found = max(len(nees) // 20, 1), list[int]()
+    for step in np.argsort(-nees, kind="stable"):
+        if nees[step] < 0.0 or len(found) == MOST:
+            break
+        if all(abs(int(step) - other) >= apart for other in found):
+            found.append(int(step))
+    return np.array(found, np.int64)
+
+
+def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
+    """NIS / dof above, the e-value below, over time, or the steps of a file without; or test ratios of each sensor."""
+    if isinstance(shown, Watched):
+        figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
+        _draw_sizes(above, shown)
+        _draw_evidence(below, shown)
+        return figure
+    figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
+    for axes, each in zip(panels, shown, strict=True):
+        _draw_ratios(axes, each)
+    panels[-1].set_xlabel("t / s")
+    return figure
+
+
+def _draw_ratios(axes: Axes, each: GateRatios) -> None:
+    """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
+    points(axes, each.t, each.ratio, EACH_STEP, limit=LONG)
+    for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)):
+        if np.isfinite(at):
+            axes.axhline(at, **stroke(look))
+    axes.set(ylabel="test ratio", title=each.sensor)
+
+
+def _draw_sizes(axes: Axes, watched: Watched) -> None:
+    """NIS over its degrees of freedom."""
+    step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
+    points(axes, step, ratio, EACH_STEP, limit=POINTS)
+    axes.axhline(1.0, **stroke(EXPECTED))
+    axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
+    if (ratio > 0).any():
+        log_axis(axes, "y")
+
+
+def _draw_evidence(axes: Axes, watched: Watched) -> None:
+    """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
+
+    What continues beyond the square of that value is cut off.
+    """
+    threshold, alarm = watched.monitor.threshold, watched.alarm
+    clock, label = _clock(watched)
+    if alarm is not None:
+        since, raised = float(alarm.since), float(alarm.step)
+        if label != "step":
+            since, raised = watched.since_t, watched.alarm_t
+        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0)
+        axes.axvline(raised, **stroke(FAULT))
+    axes.axhline(threshold, **stroke(LIMIT))
+    curve(axes, clock, watched.evidence, style(0))
+    axes.set(xlabel=label, ylabel="e-value")
+    log_axis(axes, "y")
+    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
+
+
+def _clock(watched: Watched) -> tuple[Array, str]:
+    """Times of the steps, s, or their numbers where some have none; and what they are."""
+    if len(watched.t) and np.isfinite(watched.t).all():
+        return watched.t, "t / s"
+    return watched.step, "step"
+
+
+def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:
+    """Steps and ratios (N,) averaged over as many neighbours as leave few enough points; how many those are."""
+    known = np.isfinite(ratio)
+    step, ratio = step[known], ratio[known]
+    together = max(1, -(-len(ratio) // POINTS))
+    starts = np.arange(0, len(ratio), together)
+    if together == 1:
+        return step, ratio, 1
+    counts = np.diff(np.append(starts, len(ratio)))
+    return np.add.reduceat(step, starts) / counts, np.add.reduceat(ratio, starts) / counts, together

@@ -1,13 +1,41 @@
-"""Verdicts on estimators that were judged on the same runs, and how a verdict comes about."""
+"""Estimators that were judged on the same runs.
+
+Their verdicts, what the referee asked of each, and the axis along the runs.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from consistency.referee.diagnostics.verdict.parts import ABOUT, MAIN, Answer
+from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
-from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Reasons, table
-from consistency.referee.document.judged_filters import FILTER, cells, columns, page, reason, with_values
-from consistency.referee.pages.judged_estimators import Estimator, Judged
+from consistency.referee.document import blocks
+from consistency.referee.document.blocks import (
+    Block,
+    Cell,
+    Column,
+    Heading,
+    Look,
+    Name,
+    Reasons,
+    Small,
+    Stack,
+    Switch,
+    Text,
+    p_cell,
+    style,
+    table,
+)
+from consistency.referee.document.tables import FILTER, cells, columns, page, reason, with_values
+from consistency.referee.types import Array, Failure, Indices
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FAILURES = (
     Column("Filter", width="1.4fr"),
@@ -16,6 +44,11 @@ FAILURES = (
     Column("Reason", width="3fr"),
 )
 STEP_1 = "A run that failed in step 1 has no estimates; a hang or a crash is counted there, in whatever step it was."
+FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
+MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}
+NARROW = 4  # filters beside which the questions have less room
+EPOCH = 1e6  # s; times beyond are shown from the first on
+DECADE = 10.0  # values that span more are drawn on a log axis
 
 
 def judgement(study: Judged) -> list[Block]:
@@ -121,3 +154,186 @@ def _consistent(track: Estimator) -> str:
         f"the ratio of true to stated covariance {inside}. With neither a fault nor that, a filter is undecided: its "
         "sentence has the ratio, its interval, and the number of runs that would probably decide."
     )
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question to all filters."""
+
+    name: str
+    about: str  # what is compared
+    answers: tuple[Answer | None, ...]  # None: could not be asked
+
+
+def asked(study: Judged) -> tuple[Question, ...]:
+    """All questions in the referee's order, with the answers that the verdicts hold."""
+    by_filter = [{a.question: a for a in track.verdict.answers} for track in study.tracks]
+    known = list(ABOUT) + [q for answers in by_filter for q in answers if q not in ABOUT]
+    questions = []
+    for name in dict.fromkeys(known):
+        given = tuple(answers.get(name) for answers in by_filter)
+        if any(answer is not None for answer in given):
+            questions.append(Question(name, ABOUT.get(name, ""), given))
+    return tuple(questions)
+
+
+def diagnosis(study: Judged) -> tuple[Block, ...]:
+    """Table with a row for each question and a column for each filter."""
+    heading, questions = Heading("Diagnosis"), asked(study)
+    if not questions:
+        return heading, Text("There was nothing to ask.")
+    width = "3.2fr" if len(study.tracks) > NARROW else "2.2fr"
+    filters = (Column(track.name, width="1fr", number=True) for track in study.tracks)
+    columns = (Column("Question, and what is compared", width=width), *filters)
+    rows: list[tuple[blocks.Cell, ...]] = [
+        (Stack(q.name, (Small(q.about),), bold=True), *map(_cell, q.answers)) for q in questions
+    ]
+    label = f"Questions asked of the filters of {study.name}"
+    return heading, table(columns, rows, label, caption=marks_caption(study), style="marks", whole=True)
+
+
+def answer_cell(answer: Answer | None) -> tuple[str, str]:
+    """Mark, one of MARKS, and corrected p value of one filter's answer to one question."""
+    if answer is None:
+        return NOT_ASKED, ""
+    mark = NOT_FOUND
+    if answer.tolerated:
+        mark = TOLERATED
+    elif answer.found:
+        mark = FOUND
+    return mark, p_cell(answer.adjusted)
+
+
+def _cell(answer: Answer | None) -> blocks.Answer:
+    mark, p = answer_cell(answer)
+    emphasis = {FOUND: "found", TOLERATED: "tolerated"}.get(mark, "")
+    return blocks.Answer(mark, MARKS[mark], p, emphasis)  # type: ignore[arg-type]
+
+
+def marks_caption(study: Judged) -> str:
+    """How to read the table."""
+    tracks = study.tracks
+    rate = 100 * tracks[0].verdict.settings.false_alarm if tracks else 5.0
+    tolerance = next((track.verdict.settings.tolerated for track in tracks), 1.0)
+    within = f"{TOLERATED} one was found, but is shown to lie within the tolerance of ×{tolerance:g}, "
+    tolerated = any(answer.tolerated for track in tracks for answer in track.verdict.answers)
+    text = (
+        f"{FOUND} a fault was found, {within if tolerated else ''}{NOT_FOUND} none was found, "
+        f"{NOT_ASKED} could not be asked. The number is the corrected p value: the false-alarm rate of the whole "
+        f"verdict at which the fault would just be found ({rate:.2g} % or less is a fault)."
+    )
+    if study.until_decided:
+        text += f" A verdict between two looks asks {MAIN} alone; the p values of the others are then 1."
+    return text
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A place on the axis for each of T steps."""
+
+    values: Array  # (T,)
+    label: str
+    word: str  # "s" or "step"
+    note: str = ""  # where the clock begins, if not at zero
+
+    def name(self, axes: Axes) -> None:
+        """The name of the axis of time, below a panel."""
+        axes.set_xlabel(self.label)
+
+    def span(self, axes: Axes) -> None:
+        """Draw the axis from zero to the last step."""
+        self.name(axes)
+        if len(self.values):
+            axes.set_xlim(min(0.0, float(self.values[0])), float(self.values[-1]))
+
+
+def time_axis_of(t: Array) -> Clock:
+    """Seconds from the first step on, or steps where not all have an increasing time.
+
+    Parameters
+    ----------
+    t : (T,), s; NaN where a step has none
+    """
+    if not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
+        return Clock(np.arange(1.0, len(t) + 1), "step", "step")
+    if abs(t[0]) < EPOCH:
+        return Clock(t, "time (s)", "s")
+    return Clock(t - t[0], "time (s)", "s", f" Time 0 is {t[0]:.2f} s.")
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One filter or estimator in one study, with the verdict on it."""
+
+    name: str
+    style: int  # the same number for the same filter in the whole report
+    tag: str  # of the filter in this study, which its checkbox has
+    verdict: Verdict
+    failures: tuple[Failure, ...]  # of all runs, also of those after the look that decided
+
+    @property
+    def look(self) -> Look:
+        return style(self.style)
+
+    @property
+    def innovations_judged(self) -> bool:
+        """Whether the filter declares an optimal gain; innovations of any other are reported only."""
+        return self.verdict.innovations is not None and self.verdict.innovations.judged
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Estimators that were judged on the same runs."""
+
+    name: str
+    summary: str
+    runs: int
+    shown_run: int  # the one that is drawn where only one can be
+    clock: Clock
+    steps: Indices  # (T,), 1..T
+    tracks: tuple[Estimator, ...]
+    until_decided: bool  # each verdict is that of the look that decided it
+
+    @property
+    def has_truth(self) -> bool:
+        return any(track.verdict.scale is not None for track in self.tracks)
+
+    @property
+    def single(self) -> bool:
+        """One run: the curve is a NEES, no average."""
+        return self.runs == 1
+
+    @property
+    def statistic(self) -> str:
+        return "NEES" if self.single else "ANEES"
+
+    @property
+    def judged(self) -> list[str]:
+        """Filters whose innovations are judged."""
+        return [track.name for track in self.tracks if track.innovations_judged]
+
+    @property
+    def own_errors(self) -> list[str]:
+        """Filters that are judged in an error of their own, with its convention."""
+        return [f"{t.name} ({t.verdict.convention})" for t in self.tracks if t.verdict.world is not None]
+
+    @property
+    def failures(self) -> list[tuple[str, int, int, str]]:
+        """Filter, run, step and reason of every failed run."""
+        return [
+            (track.name, int(failure.run), int(failure.step), failure.reason)
+            for track in self.tracks
+            for failure in track.failures
+        ]
+
+    @property
+    def switches(self) -> tuple[Switch, ...]:
+        """Filters that a reader can hide."""
+        return tuple(Switch(track.name, track.look, track.tag) for track in self.tracks)
+
+
+def wide(values: list[Array]) -> bool:
+    """Whether the values above zero, in arrays of any shape, span more than a decade."""
+    flat = np.concatenate([v.ravel() for v in values]) if values else np.empty(0)
+    flat = flat[np.isfinite(flat) & (flat > 0)]
+    return bool(flat.size) and bool(flat.max() > DECADE * flat.min())

@@ -6,22 +6,31 @@ Renderers of ``show`` write them. No statistic is computed here that the diagnos
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.words.numbers import plural, with_subject
+from consistency.referee.document.blocks import Chapter, Document, Facts, Text, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
+from consistency.referee.pages import verdicts
+from consistency.referee.pages import verdicts as questions_table
+from consistency.referee.pages.ratio_figures import by_axis, ratio_by_group_figure
+from consistency.referee.pages.record_figures import record_figures
+from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
 from consistency.referee.show import FORMATS, rendered
-from consistency.referee.system.atomic import write_whole
+from consistency.referee.system.stopping import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable
 
     from matplotlib.figure import Figure as Drawing
 
-    from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.verdict.verdict import Verdict
-    from consistency.referee.document.blocks import Document
     from consistency.referee.system.progress import Advance
 
 REPORT_FILES = ("report.html", "report.pdf", "verdict.json")
@@ -48,8 +57,7 @@ def write_file_pages(
     records: Sequence[Record], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
-    from consistency.referee.pages.files_report import compose_files
-    from consistency.referee.system.provenance import manifest_of
+    from consistency.referee.system.folders import manifest_of
 
     write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
@@ -76,9 +84,7 @@ def write_file_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.pages.files_report import compose_files
-    from consistency.referee.system.folders import write_folder
-    from consistency.referee.system.provenance import manifest_of
+    from consistency.referee.system.folders import manifest_of, write_folder
 
     manifest = manifest_of(kind="verdict", source=title)
     document = compose_files(records, judged, title, manifest)
@@ -144,7 +150,7 @@ def write_document(
 ) -> None:
     """The document in both formats, each file whole or not at all; None leaves one out."""
     from consistency.referee.show import as_html
-    from consistency.referee.show.svg import paint
+    from consistency.referee.show.figures import paint
 
     contents: list[tuple[Path, bytes]] = []
     pictures = paint(document)
@@ -183,7 +189,7 @@ def plotted(draw: Callable[[], Drawing], path: str | Path | None) -> Drawing:
         Matplotlib is not installed, the kind of file is unknown, or it cannot be written.
     """
     require("a plot", "plot")
-    from consistency.referee.show.svg import drawn, saved
+    from consistency.referee.show.figures import drawn, saved
 
     figure = drawn(draw)
     if path is not None:
@@ -213,3 +219,86 @@ def write_file(path: Path, content: bytes) -> None:
         write_whole(path, content)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def compose_files(
+    records: Sequence[Record], judged: Mapping[str, Verdict], title: str, manifest: Mapping[str, Any]
+) -> Document:
+    """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
+    named = {record.name: record for record in records}
+    study = _study(tuple(judged.values()), title)
+    several = len(judged) > 1
+    chapters = [
+        Chapter(
+            f"estimator-{i}",
+            name,
+            name,
+            (
+                *[Text(with_subject(name, _ended(verdict.reasons[0])))] * several,
+                *record_figures(named[name], verdict),
+                *ratio_by_group_figure(verdict),
+            ),
+            _counts(named[name], verdict),
+        )
+        for i, (name, verdict) in enumerate(judged.items())
+    ]
+    blocks = (
+        *verdicts.judgement(study), *questions_table.diagnosis(study), *by_axis(study),
+        Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
+    )  # fmt: skip
+    notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))
+    read = tuple(Text(_begun(note)) for note in notes)
+    chapters += [
+        Chapter("verdicts", "Verdict in figures", "Figures", blocks),
+        Chapter("provenance", "What was read", "Files", (*read, Facts(facts(dict(manifest))))),
+    ]
+    return Document(f"Estimator consistency: {title}", answer(judged), tuple(chapters))
+
+
+def answer(judged: Mapping[str, Verdict]) -> str:
+    """The sentence of each verdict."""
+    return " ".join(with_subject(name, _ended(verdict.reasons[0])) for name, verdict in judged.items())
+
+
+def _begun(note: str) -> str:
+    """A note as a sentence; a path at its beginning stays as it is."""
+    if "/" in note.split(maxsplit=1)[0]:
+        return _ended(note)
+    return _ended(note[:1].upper() + note[1:])
+
+
+def _ended(sentence: str) -> str:
+    return sentence if sentence.endswith((".", "?")) else f"{sentence}."
+
+
+def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
+    tracks = tuple(Estimator(v.filter, i, f"0-{i}", v, v.failures) for i, v in enumerate(judged))
+    runs, steps = max(v.runs for v in judged), max(v.steps for v in judged)
+    return Judged(title, "", runs, 0, time_axis_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
+
+
+def _counts(record: Record, verdict: Verdict) -> str:
+    clock = time_axis_of(record.t)
+    length = plural(verdict.steps, "step" if record.window is None else "window")
+    size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
+    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
+
+
+def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """What a manifest says of its run."""
+    versions = manifest.get("versions") or {}
+    wall, screening = manifest.get("wall_time_s"), manifest.get("screening")
+    rows = {
+        "Date": manifest.get("date"),
+        "Seed": manifest.get("seed"),
+        "Runs": manifest.get("runs"),
+        "Scenario hash": manifest.get("scenario_hash"),
+        "Screened": screening and "{broken} of {judged} observations leave the common motion".format_map(screening),
+        "Command": manifest.get("command"),
+        "Git commit": manifest.get("git_commit"),
+        "Wall time": None if wall is None else f"{number(float(wall), '.1f')} s",
+        "Versions": ", ".join(f"{name} {version}" for name, version in versions.items()) or None,
+    }
+    if manifest.get("complete") is False:
+        rows["Complete"] = "no: the run was interrupted; the numbers are of the finished runs"
+    return tuple((name, str(value)) for name, value in rows.items() if value is not None)

@@ -1,14 +1,16 @@
-"""N runs of a program: done in parallel, read as they come, looked at on the way, and judged."""
+"""N runs of a program: done in parallel, read as they come, judged, and kept in a folder that is resumed."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import queue
 import shutil
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,17 +18,24 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
-from consistency.referee.diagnostics.planning.early_stopping import Design, sequential_design
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.skipped_start import Skip
+from consistency.referee.diagnostics.questions.planning import Design, sequential_design
+from consistency.referee.diagnostics.records.record import Record, Skip
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.gating.checked_arrays import planned_dof, rate_shares
-from consistency.referee.programs.process import Processes, Stopped, run_program
-from consistency.referee.programs.study_folder import new_folder, opened_study, require_usable, write_manifest
-from consistency.referee.programs.words import OF_A_RUN, Program, seed_of
+from consistency.referee.gating.checked_input import planned_dof, rate_shares
+from consistency.referee.parsing import one_line
+from consistency.referee.programs.process import (
+    OF_A_RUN,
+    Processes,
+    Program,
+    Stopped,
+    inputs_of,
+    program_of,
+    run_program,
+    seed_of,
+)
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
@@ -38,16 +47,172 @@ from consistency.referee.readers.pipeline.program_runs import (
     kind_of_failure,
     log_lines,
     runs_in,
+    study_in,
     without_log,
 )
-from consistency.referee.readers.pipeline.read_files import GUESS, checked_options, found_in, records_of_found
+from consistency.referee.readers.pipeline.read_files import (
+    GUESS,
+    PROGRAM_RUNS,
+    checked_options,
+    found_in,
+    is_program_runs,
+    records_of_found,
+)
 from consistency.referee.readers.truth_matching import Estimator
+from consistency.referee.system.folders import IN_PYTHON, manifest_of, writing
 from consistency.referee.system.progress import Advance, progress, say
+from consistency.referee.system.stopping import PARTIAL, write_whole
+from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
+FOR_PLAN = ("until_decided", "max_runs", "seed", "jobs", "timeout", "check_seed", "keep", "optimal_gain")
 ALIKE = 3  # first runs that failed alike stop a study
 HOPELESS = 20  # and so many that failed in any way
 IS_WINDOWS = os.name == "nt"
 PROOF = 2  # first runs whose tables must differ
+LOCK = ".lock"
+SAME = {  # keys of the manifest that a resumed study must have, and what they are called
+    "words": "the words of the command have",
+    "files": "{} has",
+    "seed": "--seed has",
+    "inputs": "the files of --each have",
+    "cwd": "--cwd has",
+}
+
+
+def monte_carlo(
+    argv: Sequence[str],
+    runs: int | None = None,
+    *,
+    estimates: str = "estimates.csv",
+    truth: str | Path | None = None,
+    out: str | Path | None = None,
+    each: str | None = None,
+    filter: str | None = None,
+    until_decided: bool = False,
+    max_runs: int | None = None,
+    seed: int = 0,
+    jobs: int = -1,
+    timeout: float | None = None,
+    cwd: str | Path | None = None,
+    check_seed: bool = False,
+    keep: str = "all",
+    resume: bool = False,
+    overwrite: bool = False,
+    optimal_gain: bool = False,
+    skip: str | float | None = None,
+    false_alarm: float | None = None,
+    detect: float | None = None,
+    power: float | None = None,
+    tolerance: float | None = None,
+    allow: str | None = None,
+    lost: float | None = None,
+    **reading: Any,
+) -> Verdict:
+    """Run any program many times, as ``consistency monte-carlo`` does, and judge the estimates that it writes.
+
+    A filter in Python has :func:`consistency.run_trials`, a simulation :mod:`consistency.testing`.
+
+    Parameters
+    ----------
+    argv : words of the command, the program first. In each run ``{run}``, ``{seed}`` (an integer from 1 to 2^31 - 1),
+        ``{out}`` (the folder of the run, in which the program is started), ``{here}`` (the present folder) and
+        ``{worker}`` are replaced; all other braces stay. No shell sees them
+    runs : number of runs; as many as a verdict takes for the errors of the first run if not given
+    estimates, truth : files that the program writes in the folder of a run; a truth of ``{here}/truth.csv`` serves all
+        runs, and a table may have the truth in columns beside the estimates
+    out : folder of the runs, which must not exist; a temporary one if not given
+    each : pattern of recorded files or folders, with a run for each of them in place of ``runs``: ``{input}`` and, its
+        name without suffix, ``{name}``
+    filter : which estimator, where the tables hold several
+    until_decided, max_runs : as many runs as the verdict takes, at looks whose error rates hold together
+    seed : number from which the seeds of all runs follow
+    jobs : runs at a time; -1 is one a core
+    timeout : s a run, after which it is killed
+    cwd : working folder of the program
+    check_seed : do run 0 twice, and say whether its tables are the same
+    keep : "failed" deletes the files of other runs when their numbers were read
+    resume, overwrite : do the runs that are missing in ``out``; replace it
+    optimal_gain, skip, false_alarm, detect, power, tolerance, allow, lost : as for :func:`consistency.judge`
+    reading : further options of :func:`consistency.read`, as ``state`` or ``error``
+
+    Raises
+    ------
+    InputError
+        There is no such program; ``out`` cannot be used; the first runs all failed alike or wrote the same table; as
+        :func:`consistency.read`.
+    """
+    settings = settings_of(
+        false_alarm=false_alarm, detect=detect, power=power, tolerance=tolerance, allow=allow, lost=lost
+    )
+    options: dict[str, Any] = {
+        "each": each, "cwd": cwd, "resume": resume, "overwrite": overwrite, "skip": skip,
+        "until_decided": until_decided, "max_runs": max_runs, "seed": seed, "jobs": jobs, "timeout": timeout,
+        "check_seed": check_seed, "keep": keep, "optimal_gain": optimal_gain,
+    }  # fmt: skip
+    records, verdicts = _run(argv, settings, runs, estimates, truth, out, **options, **reading)
+    record = _chosen(records, filter)
+    return verdicts[record.name]
+
+
+def record_of_program(
+    argv: Sequence[str],
+    settings: Settings,
+    runs: int | None,
+    estimates: str,
+    truth: str | Path | None,
+    out: str | Path | None,
+    filter: str | None,
+    **options: Any,
+) -> Record:
+    """Record of the runs of a program, whose number follows from the settings; as :func:`monte_carlo`."""
+    records, _ = _run(argv, settings, runs, estimates, truth, out, **options)
+    return _chosen(records, filter)
+
+
+def _run(
+    argv: Sequence[str],
+    settings: Settings,
+    runs: int | None,
+    estimates: str,
+    truth: str | Path | None,
+    out: str | Path | None,
+    *,
+    each: str | None = None,
+    cwd: str | Path | None = None,
+    skip: str | float | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    **options: Any,
+) -> tuple[list[Record], dict[str, Verdict]]:
+    here = Path.cwd()
+    of_plan = {name: options.pop(name) for name in FOR_PLAN if name in options}
+    for name in options:
+        if name not in Reading.__dataclass_fields__:
+            raise TypeError(f"monte_carlo: unknown option '{name}'")
+    options["truth"] = truth
+    for name in PATHS:
+        if options.get(name) is not None:
+            options[name] = Path(options[name])
+    if cwd is not None:
+        cwd = Path(cwd)
+    program = program_of(argv, here, cwd)
+    inputs = () if each is None else inputs_of(each, here)
+    plan = Plan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
+    reading = Reading(**options)
+    if out is not None:
+        return run_study(program, plan, Path(out), estimates, reading, resume, overwrite)
+    with tempfile.TemporaryDirectory(prefix="consistency-") as folder:
+        return run_study(program, plan, Path(folder) / "runs", estimates, reading, resume, overwrite)
+
+
+def _chosen(records: Sequence[Record], name: str | None) -> Record:
+    """The record of the estimator of that name, or of the only one."""
+    named = {record.name: record for record in records}
+    if name is None and len(named) > 1:
+        raise InputError(f"the program writes several estimators ({', '.join(named)}); choose one with filter=")
+    if name is not None and name not in named:
+        raise InputError(f"filter '{name}' is not in the estimates; there are: {', '.join(named)}")
+    return named[name or next(iter(named))]
 
 
 @dataclass(frozen=True)
@@ -402,3 +567,106 @@ def _digits(one: Estimator) -> list[bytes]:
     p = one.runs[0]
     arrays = (p.t, p.estimate, p.truth, p.nis)
     return [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
+
+
+def require_usable(folder: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse, before any work, a folder that is not to be written.
+
+    Raises
+    ------
+    InputError
+        It exists without ``resume`` or ``overwrite``, is not a folder of this command, or cannot be written.
+    """
+    if resume and overwrite:
+        raise InputError("--resume continues with what --overwrite would replace; give one of them")
+    try:
+        there = folder.exists() or folder.is_symlink()
+    except (OSError, ValueError) as error:
+        raise InputError(f"--out {one_line(folder)}: no folder can have that name ({one_line(error, 60)})") from None
+    if not there:
+        return
+    if not folder.is_dir() or not (is_program_runs(folder) or _is_begun(folder)):
+        raise InputError(f"--out {folder}: is not a folder of 'consistency monte-carlo'; name another one")
+    if not (resume or overwrite or _is_begun(folder)):
+        raise InputError(
+            f"--out {folder}: exists already; choose another folder, or add --resume or --overwrite {IN_PYTHON}"
+        )
+
+
+def _is_begun(folder: Path) -> bool:
+    """Whether a folder is empty, or that of a command that was killed before it wrote a manifest."""
+    names = [path.name for path in folder.iterdir()]
+    return all(name == LOCK or name.endswith(PARTIAL) for name in names)
+
+
+@contextmanager
+def opened_study(folder: Path, manifest: Mapping[str, Any], resume: bool) -> Iterator[ProgramStudy]:
+    """The folder with its manifest, locked; without ``resume`` runs that it held are removed.
+
+    Raises
+    ------
+    InputError
+        Another process works on it, it cannot be written, or the study to resume is another one.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder):
+        if resume and is_program_runs(folder):
+            _require_same(study_in(folder), manifest)
+        else:
+            _clear(folder)
+        with writing(folder):
+            (folder / "runs").mkdir(exist_ok=True)
+            study = ProgramStudy(folder, write_manifest(folder, manifest))
+        yield study
+
+
+def write_manifest(folder: Path, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``manifest.json`` with these fields, whole or not at all, and return it."""
+    manifest = manifest_of(kind=PROGRAM_RUNS, **fields)
+    write_whole(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
+    return manifest
+
+
+def new_folder(study: Path, run: int) -> Path:
+    """A name for a run that no folder has: a child of an earlier try may still write into that one's."""
+    base = study / "runs" / f"{run:04d}"
+    names = itertools.chain([base], (base.with_name(f"{base.name}-{number}") for number in itertools.count(2)))
+    return next(path for path in names if not path.exists())
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder; the system releases it when this process ends, however it ends."""
+    import fcntl
+
+    with (folder / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"--out {folder}: another 'consistency monte-carlo' works on it") from None
+        yield
+
+
+def _clear(folder: Path) -> None:
+    """Remove runs of an earlier study; their folder has another name first, so that none is taken for a new one."""
+    aside = folder / f".replaced-{os.getpid()}"
+    with writing(folder), suppress(FileNotFoundError):
+        (folder / "runs").rename(aside)
+    for old in folder.glob(".replaced-*"):
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _require_same(before: ProgramStudy, manifest: Mapping[str, Any]) -> None:
+    """Refuse to resume another study."""
+    for key, what in SAME.items():
+        if before.manifest.get(key) != manifest.get(key):
+            what = what.format(_changed(before.manifest.get(key), manifest.get(key)))
+            raise InputError(f"--resume: {what} changed since the runs in {before.folder}; use --overwrite")
+
+
+def _changed(old: Any, new: Any) -> str:
+    """Which file changed."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return ""
+    return str(next(name for name in {**old, **new} if old.get(name) != new.get(name)))

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import DECLARED
+from consistency.referee.diagnostics.questions.uncertain_truth import DECLARED
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.valid_covariances import ROUNDED, Validity, classify
+from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of

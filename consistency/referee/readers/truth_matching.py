@@ -12,9 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.valid_covariances import ROUNDED
-from consistency.referee.geometry import wrap
-from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.diagnostics.records.whitening import ROUNDED
+from consistency.referee.geometry import planar_error, wrap
 from consistency.referee.readers.places import Places
 from consistency.referee.types import Array, Indices
 
@@ -239,7 +238,7 @@ class Poses:
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
         error = planar_error
         if self.manifold == "spatial":
-            from consistency.referee.geometry.lie_groups import state_error as error
+            from consistency.referee.geometry import state_error as error
         out[finite] = error(truth[finite], estimate[finite], self.convention)
         return out
 

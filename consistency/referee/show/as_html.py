@@ -20,6 +20,7 @@ from consistency.referee.document.blocks import (
     Facts,
     Figure,
     Heading,
+    Look,
     Name,
     Reason,
     Reasons,
@@ -29,10 +30,10 @@ from consistency.referee.document.blocks import (
     Switch,
     Table,
     Text,
+    unbroken,
+    written,
 )
-from consistency.referee.document.colours import Look
-from consistency.referee.document.wording import unbroken, written
-from consistency.referee.show.svg import Pictures, paint
+from consistency.referee.show.figures import Pictures, paint
 
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = (TEMPLATES / "report.css").read_text(encoding="utf-8")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.verdict import plain
 from consistency.referee.document.blocks import Document
 
 

@@ -5,8 +5,19 @@ from __future__ import annotations
 import re
 
 from consistency.referee.diagnostics.words.numbers import with_subject
-from consistency.referee.document.blocks import Block, Bullets, Cell, Document, Facts, Heading, Reasons, Table, Text
-from consistency.referee.document.wording import PLAIN, written
+from consistency.referee.document.blocks import (
+    PLAIN,
+    Block,
+    Bullets,
+    Cell,
+    Document,
+    Facts,
+    Heading,
+    Reasons,
+    Table,
+    Text,
+    written,
+)
 
 MARKUP = re.compile(r"[*]|(?<!\w)_|_(?!\w)|~(?=~)|\[(?![-+.\d][^\]]*\](?!\())|(?<=\])\(")  # but intervals: [1.4, 2.0]
 ESCAPED = (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("`", "\\`"))

@@ -15,8 +15,8 @@ import matplotlib as mpl
 import typst
 
 from consistency.referee.document import blocks
-from consistency.referee.document.wording import unbroken, written
-from consistency.referee.show.svg import Pictures, paint
+from consistency.referee.document.blocks import unbroken, written
+from consistency.referee.show.figures import Pictures, paint
 from consistency.referee.system.stopping import AT_STOP, remove_at_stop
 
 TEMPLATE = "report.typ"

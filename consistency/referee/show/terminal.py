@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from consistency.referee.document.blocks import Block, Cell, Reasons, Status, Table
-from consistency.referee.document.wording import PLAIN, fragment, written
+from consistency.referee.document.blocks import PLAIN, Block, Cell, Reasons, Status, Table, fragment, written
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",

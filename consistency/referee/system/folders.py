@@ -1,23 +1,47 @@
-"""Output folders: files and a manifest, written whole or not at all."""
+"""Output folders: files and a manifest, written whole or not at all.
+
+Where a file came from, and the data that come with the package.
+"""
 
 from __future__ import annotations
 
+import ast
+import functools
 import itertools
 import json
 import os
+import platform
+import re
+import shlex
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import datetime, timezone
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, read_json
-from consistency.referee.system.atomic import left_beside, make_durable, partial_folder, umask
-from consistency.referee.system.provenance import SCHEMA_VERSION
-from consistency.referee.system.stopping import AT_STOP, remove_at_stop
+from consistency.referee.system.stopping import (
+    AT_STOP,
+    left_beside,
+    make_durable,
+    partial_folder,
+    remove_at_stop,
+    umask,
+)
 
 IN_PYTHON = "(overwrite=True in Python)"
+NOT_OURS = "opencv"  # brings a BLAS of its own, with which no run is computed
+SCHEMA_VERSION = 1
+PACKAGES = (
+    "filter-consistency", "numpy", "scipy", "numba", "filterpy", "pandas", "pyarrow", "joblib", "matplotlib",
+    "typst",
+)  # fmt: skip
+SUMMARY = re.compile(r'^summary = "(.*)"$', re.MULTILINE)
 
 # --- writing -------------------------------------------------------------------------------------
 
@@ -211,3 +235,127 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("schema_version") != SCHEMA_VERSION:
         raise InputError(f"{path}: key 'schema_version' must be {SCHEMA_VERSION}; write the folder again")
     return manifest
+
+
+@functools.cache
+def _found() -> tuple[tuple[str, str], ...]:
+    cores = set()
+    with suppress(ImportError):  # nothing is simulated then
+        from threadpoolctl import threadpool_info
+
+        for library in threadpool_info():
+            if library["user_api"] == "blas" and NOT_OURS not in library["filepath"]:
+                cores.add(str(library.get("architecture")))
+    return ("cpu", _cpu()), ("blas", ", ".join(sorted(cores)) or "unknown")
+
+
+def this_machine() -> dict[str, str]:
+    """``cpu``: model of the processor; ``blas``: for which architecture the loaded BLAS has chosen its code.
+
+    The last bits of results depend on both.
+    """
+    return dict(_found())
+
+
+def in_words(machines: Iterable[Mapping[str, str]]) -> str:
+    """Machines as :func:`this_machine` has them, for a sentence."""
+    return " and ".join(f"{machine.get('cpu')} (BLAS: {machine.get('blas')})" for machine in machines)
+
+
+def _cpu() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or "unknown"
+
+
+def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
+    """Provenance that every output folder of a ``kind`` (results, log, findings) carries."""
+    wall = fields.pop("wall", None)
+    if wall is not None:
+        wall = round(wall, 3)
+    program = Path(sys.argv[0]).name
+    if program == "__main__.py":
+        program = "consistency"
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "kind": kind,
+        "date": datetime.now(timezone.utc).date().isoformat(),
+        "versions": dict(_versions()),
+        "machines": [this_machine()],
+        "command": shlex.join([program, *sys.argv[1:]]),
+        "git_commit": _git_commit(),
+        "wall_time_s": wall,
+        **fields,
+    }
+
+
+@functools.cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    """Python and the packages that results depend on; reading them takes milliseconds, so once a process."""
+    versions = [("python", platform.python_version())]
+    for package in PACKAGES:
+        try:
+            versions.append((package, metadata.version(package)))
+        except metadata.PackageNotFoundError:
+            versions.append((package, "not installed"))
+    return tuple(versions)
+
+
+@functools.cache
+def _git_commit() -> str | None:
+    """Commit of the checkout that the package runs from, with ``-dirty`` where it was changed; None elsewhere.
+
+    Asked once a process, as its modules are read once.
+    """
+    root = Path(__file__).parents[3]
+    if not (root / ".git").exists():  # installed, perhaps inside somebody else's repository
+        return None
+    command = ["git", "-C", str(root), "status", "--porcelain=v2", "--branch", "--untracked-files=no"]
+    try:
+        lines = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        return None
+    commit, changed = None, ""
+    for line in lines:
+        if line.startswith("# branch.oid "):
+            commit = line.split()[-1]
+        elif not line.startswith("#"):
+            changed = "-dirty"
+    if commit in (None, "(initial)"):
+        return None
+    return f"{commit}{changed}"
+
+
+def data_folder(name: str) -> Path:
+    """Folder of shipped data (``scenarios``, ``experiments``): inside the wheel, else beside the package."""
+    inside = Path(str(resources.files("consistency"))) / "_data" / name
+    beside = Path(str(resources.files("consistency"))).parent / name
+    if inside.is_dir():
+        return inside
+    return beside
+
+
+def summaries() -> dict[str, dict[str, str]]:
+    """A line about each shipped scenario, experiment and sweep, by its name."""
+    experiments = data_folder("experiments")
+    return {
+        "scenarios": _summaries_in(data_folder("scenarios"), "*.toml"),
+        "experiments": _summaries_in(experiments, "e[0-9][0-9]_*.py"),
+        "sweeps": _summaries_in(experiments / "sweeps", "*.toml"),
+    }
+
+
+def _summaries_in(folder: Path, pattern: str) -> dict[str, str]:
+    """The ``summary`` of each table, or the first line of each script's docstring; "" without."""
+    summaries = {}
+    for path in sorted(folder.glob(pattern)):
+        text = path.read_text(encoding="utf-8")
+        summary = ""
+        if path.suffix == ".py":
+            summary = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0]
+        elif (line := SUMMARY.search(text)) is not None:
+            summary = line[1]
+        summaries[path.stem] = summary
+    return summaries

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.monitoring.monitor import Alarm, Monitor
-from consistency.referee.diagnostics.records.skipped_start import Skip
+from consistency.referee.diagnostics.monitor import Alarm, Monitor
+from consistency.referee.diagnostics.records.record import Skip
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.ardupilot_log import STATED, is_dataflash, read_stated
+from consistency.referee.readers.formats.flight_logs import STATED, ULOG_SUFFIX, is_dataflash, read_stated, read_ulog
 from consistency.referee.readers.formats.innovation_files import (
     DEFAULT,
     NisLog,
@@ -22,7 +22,6 @@ from consistency.referee.readers.formats.innovation_files import (
     refuse_options,
     stream_nis,
 )
-from consistency.referee.readers.formats.px4_log import ULOG_SUFFIX, read_ulog
 from consistency.referee.readers.options import Reading
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import refused

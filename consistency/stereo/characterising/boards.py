@@ -11,13 +11,12 @@ import numpy as np
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import stereo
+from consistency.bench.models import observation
 from consistency.bench.scenario import PicturedSensor
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.characterising.characterise import Characterisation, characterise
-from consistency.stereo.characterising.truth_residuals import Residuals, robust_sd
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.characterising.characterise import Characterisation, Residuals, characterise, robust_sd
+from consistency.stereo.visual_odometry.arrays import opencv
 from consistency.stereo.visual_odometry.sequence import SUFFIXES, read_image
 
 COEFFICIENTS = {"full": 5, "poor": 1, "none": 0}  # of distortion models: all, k1 alone, no distortion
@@ -291,13 +290,13 @@ def _project(pose: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """Ideal (u, v, d) (c, 3) of a board; the pose is a rotation vector and a place in m, sensor axes."""
     points = Rotation.from_rotvec(pose[:3]).apply(board) + pose[3:]
     x, y, w = points.T
-    return np.stack(stereo.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
+    return np.stack(observation.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
 
 
 def _first_pose(z: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """The pose that lays the board best on the triangulated corners, Arun et al. (1987)."""
     u, v, d = z.T
-    seen = np.stack(stereo.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
+    seen = np.stack(observation.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
     middle = seen.mean(axis=0)
     middle_of_board = board.mean(axis=0)
     turn, _ = Rotation.align_vectors(seen - middle, board - middle_of_board)

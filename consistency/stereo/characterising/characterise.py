@@ -1,30 +1,52 @@
-"""Estimation of a sensor model from residuals."""
+"""Estimation of a sensor model from residuals, with its bias map.
+
+Which residuals tell of the noise is chosen here, and not by their size.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy import optimize, stats
 
 from consistency.bench.filters.compiled import one_blas_thread
+from consistency.bench.models import observation
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.node_tables import hats
+from consistency.bench.scenario.observations import bilinear, hats
+from consistency.bench.types import Trial
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
-from consistency.referee.types import Array
+from consistency.referee.types import Array, Indices
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias_map import GRID, BiasEstimate, estimate_bias, grid_of
-from consistency.stereo.characterising.coordinate_fit import Levels, ResidualTails, moving_over_rest, rate, tails
-from consistency.stereo.characterising.likelihood import LikelihoodFit, Rows, fit
-from consistency.stereo.characterising.truth_residuals import Residuals, octaves, select
+from consistency.stereo.characterising.coordinate_fit import (
+    Levels,
+    LikelihoodFit,
+    ResidualTails,
+    Rows,
+    fit,
+    moving_over_rest,
+    rate,
+    tails,
+)
 
 NAMES = ("u", "v", "d")
 RATE = 0.01  # probability that any interval misses
 LEAST = 100  # rows from which a noise can be told
 LEAST_TRACKS = 5
 SHORTEST = 1.5  # rows of a track in the mean, from which offset and correlation can be told
+GRID = (5, 4)  # nodes across and down
+TRACKS = 3  # that a node needs
+UNSURE = 5.0  # px, standard deviation of the prior that keeps a node without data from being singular
+APART = 1.25  # factor between neighbouring nodes of disparity at least
+FEW = 30  # rows that a node takes
+ENDS = 0.005  # of the data lies beyond the first and beyond the last node of disparity
+MARGIN = 4.0  # standard deviations from a limit within which the noise decides whether a row is there at all
+GROSS = 6.0  # robust standard deviations: a Gaussian error is beyond in 2 of 10^9
+MAD = 1.482602218505602  # standard deviation of a Gaussian over its median absolute deviation
+HUBER = 1.345  # standard deviations beyond which a row counts less, Huber (1964)
 
 
 @dataclass(frozen=True)
@@ -200,3 +222,257 @@ def _coordinate(k: int, of: LikelihoodFit, levels: Levels) -> Coordinate:
         bounds=bounds,
         residuals=w / w.std(),
     )
+
+
+class Grid(NamedTuple):
+    """Nodes of the image, and which have data; K across, L down."""
+
+    u: Array  # (K,), px from the principal point
+    v: Array  # (L,)
+    rows: Array  # (L K,), observations, each shared out over the nodes around it
+    known: Array  # (L K,) of bool
+
+    def regressors(self, data: Residuals) -> Array:
+        """Weights (N, L K) of the nodes in each row."""
+        return bilinear(data.ideal[:, 0], data.ideal[:, 1], self.u, self.v)
+
+    @property
+    def ridge(self) -> Array:
+        """Precision (L K,) of a prior: some where there are too few data, none elsewhere."""
+        return np.where(self.known, 0.0, UNSURE**-2)
+
+
+def grid_of(data: Residuals, u: Array, v: Array) -> Grid:
+    """Nodes at ``u`` (K,) and ``v`` (L,), and what the data have around each."""
+    weights = bilinear(data.ideal[:, 0], data.ideal[:, 1], u, v)
+    rows = weights.sum(axis=0)
+    if not len(data):
+        return Grid(u, v, rows, np.zeros(len(rows), bool))
+    tracks = (np.add.reduceat(weights, data.first, axis=0) > 1.0).sum(axis=0)
+    return Grid(u, v, rows, (rows >= FEW) & (tracks >= TRACKS))
+
+
+class BiasEstimate(NamedTuple):
+    """Bias of u, v, d at the nodes of a grid."""
+
+    grid: Grid
+    value: Array  # (3, L K), px
+    half: Array  # (3, L K), px, half widths of simultaneous intervals
+    p_value: Array  # (3,), that there is no bias anywhere
+    shown: Array  # (3,) of bool
+    believed: Array  # (3, L K), px: shrunken, 0 where nothing is known or shown
+
+    def matrix(self, k: int) -> Array:
+        """What is believed of u, v or d, (L, K)."""
+        return self.believed[k].reshape(len(self.grid.v), len(self.grid.u))
+
+
+def estimate_bias(
+    fits: Sequence[LikelihoodFit],
+    grid: Grid,
+    level: float,
+    rate: float,
+) -> BiasEstimate:
+    """Bias of each coordinate from its fit.
+
+    Parameters
+    ----------
+    level : probability that the interval of one node misses
+    rate : probability of finding a bias in a coordinate that has none
+    """
+    known = grid.known
+    value = np.full((3, len(known)), np.nan)
+    half = np.full((3, len(known)), np.nan)
+    believed = np.zeros((3, len(known)))
+    p_value = np.ones(3)
+    for k, of_coordinate in enumerate(fits):
+        beta, width, C = coordinate_fit.bias_coefficients(of_coordinate, level)
+        value[k, known] = beta[known]
+        half[k, known] = width[known]
+        if not known.any():
+            continue
+        b = beta[known]
+        S = C[np.ix_(known, known)]
+        p_value[k] = stats.chi2.sf(b @ np.linalg.solve(S, b), len(b))
+        if p_value[k] < rate:
+            believed[k, known] = shrunken(b, S)
+    return BiasEstimate(grid, value, half, p_value, p_value < rate, believed)
+
+
+def shrunken(b: Array, S: Array) -> Array:
+    """Estimates (m,) with covariance (m, m) drawn towards zero as much as their own scatter asks for.
+
+    The true values are taken as draws from N(0, w^2), with w of the largest likelihood: empirical Bayes, Efron &
+    Morris (1973).
+    """
+    values, axes = np.linalg.eigh(S)
+    along = axes.T @ b
+
+    def negative(log_w: float) -> float:
+        variance = np.exp(2.0 * log_w) + values
+        return 0.5 * (np.log(variance) + along**2 / variance).sum()
+
+    largest = np.abs(b).max() + np.sqrt(values.max()) + 1e-9
+    top = np.log(largest) + 1.0
+    best = optimize.minimize_scalar(negative, bounds=(top - 12.0, top), method="bounded")
+    w2 = np.exp(2.0 * best.x)
+    return axes @ (along * w2 / (w2 + values))
+
+
+def octaves(d: Array) -> Array:
+    """Nodes (m,) of disparity: the ends of the data and the powers of two between them, px.
+
+    Powers of two are left out until each node has ``FEW`` rows around it; a node by itself is the median.
+    """
+    low, high = np.quantile(d, [ENDS, 1.0 - ENDS])
+    if high < APART * low:
+        return np.array([np.median(d)])
+    least = np.ceil(np.log2(low * APART))
+    most = np.floor(np.log2(high / APART))
+    nodes = np.array([low, *2.0 ** np.arange(least, most + 1), high])
+    rows = hats(d, nodes).sum(axis=0)
+    while len(nodes) > 2 and rows.min() < FEW:
+        nodes = np.delete(nodes, np.clip(rows.argmin(), 1, len(nodes) - 2))
+        rows = hats(d, nodes).sum(axis=0)
+    if rows.min() < FEW:
+        return np.array([np.median(d)])
+    return nodes
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """N observations beside what they would be without error, sorted by track and step."""
+
+    r: Array  # (N, 3), measured less ideal, px
+    ideal: Array  # (N, 3), u, v, d in px
+    track: Indices  # (N,), a landmark in a run
+    step: Indices  # (N,)
+    moving: Array  # (N,) of bool, whether the sensor moved before this observation
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+    def keep(self, chosen: Array) -> Residuals:
+        """The rows for which ``chosen`` (N,) is true."""
+        return Residuals(*(value[chosen] for value in vars(self).values()))
+
+    @property
+    def first(self) -> Indices:
+        """First row of each track, (K,)."""
+        return np.flatnonzero(np.append(True, np.diff(self.track) != 0)).astype(np.int64)
+
+    @property
+    def gap(self) -> Array:
+        """Steps since the row before in the track, (N,); 0 in its first."""
+        gap = np.diff(self.step, prepend=self.step[:1]).astype(float)
+        gap[self.first] = 0.0
+        return gap
+
+
+def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Residuals, int]:
+    """Residuals of trials with true poses and landmarks, and how many rows are of things that are not landmarks.
+
+    What is ideal is Herath et al. (2007) eq. 22 at the true poses.
+    """
+    parts = []
+    strange = 0
+    for number, trial in enumerate(trials):
+        assert trial.truth is not None
+        assert trial.landmarks is not None
+        rows = np.lexsort((trial.step, trial.landmark))
+        rows = rows[trial.landmark[rows] < len(trial.landmarks)]
+        strange += len(trial.z) - len(rows)
+        step = trial.step[rows]
+        landmark = trial.landmark[rows]
+        body = observation.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
+        in_sensor = observation.to_sensor(*body, sensor.mount.packed())
+        ideal = np.stack(observation.project(*in_sensor, *sensor.rig), axis=-1)
+        track = landmark + number * trial.n_landmarks
+        parts.append((trial.z[rows] - ideal, ideal, track, step, moved_before(trial.truth)[step]))
+    return Residuals(*map(np.concatenate, zip(*parts, strict=True))), strange
+
+
+def moved_before(poses: Array) -> Array:
+    """Whether poses (T + 1, 3) differ from the one before, (T + 1,) of bool."""
+    moved = (np.diff(poses, axis=0) != 0.0).any(axis=1)
+    return np.append(False, moved)
+
+
+class RowSelection(NamedTuple):
+    """The rows that the noise is estimated from, and the others."""
+
+    kept: Residuals
+    gross: int  # rows too far off to be of the noise
+    at_limits: int  # rows left out because of the search range or the edge of the image
+    rough: Array  # (3,), px, robust standard deviations
+
+
+def select(data: Residuals, sensor: PicturedSensor, regressors: Array) -> RowSelection:
+    """Leave out rows near the limits of the sensor, by their ideal values, and those that are grossly wrong.
+
+    Near the ends of the search range only some noise is measured; ``MARGIN`` standard deviations away, the variance
+    lacks less than one part in 1000. The ideal value decides, which knows nothing of the noise of its row.
+
+    Parameters
+    ----------
+    regressors : (N, p), of the bias map
+    """
+    fits = np.column_stack([_robust(column, regressors) for column in data.r.T])
+    centred = data.r - fits
+    rough = np.array([robust_sd(column) for column in centred.T])
+    scale = np.tile(rough, (len(data), 1))
+    scale[:, 2] = _local_spread(centred[:, 2], data)
+    inside = within_limits(data.ideal + fits, MARGIN * scale, sensor)
+    gross = inside & (np.abs(centred) > GROSS * scale).any(axis=1)
+    return RowSelection(
+        data.keep(inside & ~gross),
+        gross=int(gross.sum()),
+        at_limits=int((~inside).sum()),
+        rough=rough,
+    )
+
+
+def within_limits(place: Array, margin: Array, sensor: PicturedSensor) -> Array:
+    """Rows (N,) whose u, v, d (N, 3) are by ``margin``, (N, 3) or (3,), within search range and image."""
+    inside = np.ones(len(place), bool)
+    if sensor.disparity is not None:
+        low, high = sensor.disparity
+        inside &= place[:, 2] >= low + margin[..., 2]
+        inside &= place[:, 2] <= high - margin[..., 2]
+    if sensor.image is not None:
+        for k in range(2):
+            edge = margin[..., k]
+            middle = sensor.centre[k]
+            inside &= place[:, k] >= edge - middle
+            inside &= place[:, k] <= sensor.image[k] - middle - edge
+    return inside
+
+
+def _robust(r: Array, X: Array) -> Array:
+    """Values (N,) of the regression of ``r`` on ``X`` with Huber's weights; coefficients without data are 0."""
+    beta = np.full(X.shape[1], np.median(r))
+    for _ in range(10):
+        e = r - X @ beta
+        limit = HUBER * robust_sd(e)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(e), 1e-12))
+        normal = (X * weight[:, None]).T @ X + 1e-3 * np.eye(X.shape[1])
+        beta = np.linalg.solve(normal, X.T @ (weight * r))
+    return X @ beta
+
+
+def robust_sd(e: Array) -> float:
+    """Robust standard deviation of a sample."""
+    return max(MAD * np.median(np.abs(e - np.median(e))), 1e-9)
+
+
+def _local_spread(e: Array, data: Residuals) -> Array:
+    """Robust standard deviation (N,) of rows of about the same disparity."""
+    d = np.maximum(data.ideal[:, 2], 1e-3)
+    nodes = octaves(d)
+    nearest = hats(d, nodes).argmax(axis=1)
+    out = np.full(len(e), robust_sd(e))
+    for node in range(len(nodes)):
+        own = nearest == node
+        if own.sum() >= FEW:
+            out[own] = robust_sd(e[own])
+    return out

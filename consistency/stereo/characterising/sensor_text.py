@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import PicturedSensor, toml_text
-from consistency.bench.scenario.effects.node_tables import BiasMap, DisparityGrowth
+from consistency.bench.scenario.observations import BiasMap, DisparityGrowth
 from consistency.bench.store.recorded_log import sensor_keys
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
 from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict.verdict import plain
 from consistency.referee.diagnostics.words.numbers import p_text
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
-from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import writing
-from consistency.stereo.characterising.bias_map import BiasEstimate
-from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
+from consistency.referee.system.stopping import write_whole
+from consistency.stereo.characterising.characterise import NAMES, BiasEstimate, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian
 HEADS = ("", "noise px", "correlation", "offset share", "1/nu", "kurtosis", "pooled px")

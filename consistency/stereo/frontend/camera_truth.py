@@ -11,11 +11,11 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, reading
 from consistency.referee.readers.formats.file_kinds import is_drive
 from consistency.referee.readers.formats.kitti_files import BODIES, NANO, drive_poses, place_of, read_times
-from consistency.referee.readers.formats.rotations import UNIT
+from consistency.referee.readers.formats.pose_rows import UNIT
 from consistency.referee.readers.formats.tum import read_trajectory
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.camera_pair import CAMERA_0, EUROC_BODY
+from consistency.stereo.visual_odometry.rig import CAMERA_0, EUROC_BODY
 from consistency.stereo.visual_odometry.sequence import RAW_CALIBRATION, StereoSequence, read_number_table
 
 MAX_DT = 0.01  # s between an image and its truth, as in `consistency analyse`

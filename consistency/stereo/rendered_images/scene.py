@@ -1,15 +1,22 @@
-"""Scenes of flat layers at several depths; near ones hide far ones.
+"""Scenes of flat layers at several depths, cameras with lenses, and image pairs that they take of them.
 
 What is painted on a layer: grey values over two coordinates in metres, blurred as a lens would.
+
+The point spread is round on the surface that is seen, as wide as at the depth of the pixel: exact for a surface that
+faces the camera, and on a slanted one too narrow along the slant.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.special import ndtr
 
+from consistency.bench.models import observation
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array, Indices
@@ -19,6 +26,14 @@ TILE = 256  # samples along the side of a tile: 64 of its shortest wavelengths, 
 FAINT = 1e-3  # an octave that the lens leaves less of than this is not sampled
 MIDDLE = 128.0  # grey value about which a texture varies
 NOWHERE = -1  # layer of a ray that hits none
+# Herath et al. (2007) sec. 4.5, as herath2007-stereo
+FOCAL = 150.0  # px
+BASELINE = 0.09  # m
+SIZE = (320, 240)  # px
+NEWTON = 12  # steps, after which an undistorted radius is exact to rounding
+BLUR = 0.7  # px, sd of the point spread: it leaves 9 % at half the sampling rate, and nothing that could alias
+REACH = 4.0  # sd of the point spread beyond which the border of a layer is not seen
+COARSE = 8  # px between the rays by which a layer is found in the image
 
 
 class Texture(Protocol):
@@ -280,3 +295,287 @@ class Scene:
 def to_camera(pose: Array, points: Array) -> Array:
     """Points (N, 3) of the world in the frame of a camera at ``pose`` (6,), m."""
     return (points - pose[:3]) @ rotation(*pose[3:])
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Radial distortion: a point at radius r from the axis, in units of f, is seen at r (1 + k1 r^2 + k2 r^4)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+
+    def distort(self, m: Array) -> Array:
+        """Where points (..., 2) are seen, both in units of f."""
+        r2 = np.square(m).sum(axis=-1, keepdims=True)
+        return m * (1.0 + self.k1 * r2 + self.k2 * r2**2)
+
+    def undistort(self, m: Array) -> Array:
+        """The points (..., 2) that are seen at ``m``, by Newton's method on the radius.
+
+        Raises
+        ------
+        InputError
+            The lens folds the image: no point is seen at some ``m``.
+        """
+        seen = np.sqrt(np.square(m).sum(axis=-1, keepdims=True))
+        r = seen.copy()
+        for _ in range(NEWTON):
+            slope = 1.0 + 3.0 * self.k1 * r**2 + 5.0 * self.k2 * r**4
+            if (slope <= 0.0).any():
+                raise InputError(
+                    f"lens: k1 = {self.k1:g}, k2 = {self.k2:g} folds the image at {seen.max():.2f} times the focal "
+                    "length from its centre; give a weaker distortion or a smaller image"
+                )
+            r -= (r * (1.0 + self.k1 * r**2 + self.k2 * r**4) - seen) / slope
+        zoom = np.ones_like(r)
+        np.divide(r, seen, out=zoom, where=seen > 0.0)
+        return m * zoom
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera, whose image has been rectified.
+
+    Parameters
+    ----------
+    f : px
+    size : width, height in px
+    lens : distortion of the glass
+    corrected : distortion that the rectification takes out; with that of the lens nothing is left
+    turned : roll, pitch, heading in rad, by which the camera is turned and the rectification does not know
+    """
+
+    f: float = FOCAL
+    size: tuple[int, int] = SIZE
+    lens: Lens = field(default_factory=Lens)
+    corrected: Lens = field(default_factory=Lens)
+    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def _R(self) -> Array:
+        return rotation(*self.turned)
+
+    @cached_property
+    def pixels(self) -> Array:
+        """u, v of all pixels (h, w, 2): px from the middle of the image, right and down."""
+        width, height = self.size
+        v, u = np.indices((height, width))
+        return np.stack([u - (width - 1) / 2, v - (height - 1) / 2], axis=-1)
+
+    @cached_property
+    def field(self) -> Array:
+        """Directions (h, w, 3) that the pixels look in, x forward, y left, z up."""
+        return self.rays(self.pixels)
+
+    def rays(self, uv: Array) -> Array:
+        """Directions (..., 3) that places (..., 2) of the rectified image really look in; x is about 1."""
+        m = self.lens.undistort(self.corrected.distort(np.asarray(uv, float) / self.f))
+        rays = np.ones((*m.shape[:-1], 3))
+        rays[..., 1:] = -m
+        return rays @ self._R.T
+
+    def project(self, points: Array) -> Array:
+        """Where points (..., 3) in the camera's nominal frame, m, really are in the rectified image, (..., 2) px."""
+        own = points @ self._R
+        m = -own[..., 1:] / own[..., :1]
+        return self.f * self.corrected.undistort(self.lens.distort(m))
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """Two cameras side by side; the left one is at the robot's origin, and u, v are those of its image.
+
+    u = -f y/x, v = -f z/x, d = f B/x (Herath et al. 2007, eq. 22), in px from the middle of the image, which is
+    (w/2, h/2) from its corner and ((w - 1)/2, (h - 1)/2) from the centre of its first pixel.
+    """
+
+    left: Camera = field(default_factory=Camera)
+    right: Camera = field(default_factory=Camera)
+    B: float = BASELINE  # m
+
+    def __post_init__(self) -> None:
+        if (self.left.f, self.left.size) != (self.right.f, self.right.size):
+            raise InputError("cameras: rectified images have one focal length and one size; give both cameras the same")
+
+    @classmethod
+    def distorted(cls, k1: float, turned: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> StereoCamera:
+        """The chapter's camera with a residual distortion ``k1`` in the left image and ``-k1`` in the right one."""
+        return cls(Camera(lens=Lens(k1)), Camera(lens=Lens(-k1), turned=turned))
+
+    @property
+    def f(self) -> float:
+        """Focal length, px."""
+        return self.left.f
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of an image, px."""
+        return self.left.size
+
+    @property
+    def offset(self) -> Array:
+        """Place of the right camera in the frame of the left one, (3,), m."""
+        return np.array([0.0, -self.B, 0.0])
+
+    def ideal(self, points: Array) -> Array:
+        """(u, v, d) in px of points (N, 3) in the robot frame, m, with ideal cameras: Herath et al. (2007) eq. 22."""
+        x, y, z = points.T
+        return np.stack(observation.project(x, y, z, self.f, self.B), axis=-1)
+
+    def real(self, points: Array) -> Array:
+        """(u, v, d) in px of points (N, 3) with the cameras as they are: what a chain without noise would measure."""
+        left = self.left.project(points)
+        right = self.right.project(points - self.offset)
+        return np.column_stack([left, left[:, 0] - right[:, 0]])
+
+    def inside(self, uv: Array, margin: float = 0.0) -> Array:
+        """Whether places (N, 2) px from the middle are in the image and ``margin`` px clear of its border."""
+        half = np.array(self.size) / 2.0 - margin
+        return np.asarray((np.abs(uv) <= half).all(axis=-1))
+
+
+class StereoFrame(NamedTuple):
+    """One image pair and where it was taken."""
+
+    left: Array  # (h, w), 8-bit
+    right: Array
+    pose: Array  # (6,), where the camera was: x, y, z (m), roll, pitch, heading (rad)
+    nominal: Array  # (6,), where it is said to have been
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    pose: Array,
+    offset: Array | None = None,
+) -> Array:
+    """Image (h, w) of a scene without noise, grey values as float.
+
+    Parameters
+    ----------
+    pose : (6,), of the robot in the world: x, y, z in m, roll, pitch, heading in rad
+    offset : (3,), of the camera in the robot frame, m; None for none
+    """
+    R = rotation(*pose[3:])
+    origin = pose[:3]
+    if offset is not None:
+        origin = origin + R @ offset
+    rays = camera.field @ R.T
+    image = np.full(rays.shape[:2], MIDDLE, np.float32)
+    for layer in scene.layers:
+        where = _box(layer, origin, rays, camera.f)
+        if where is not None:
+            part = image[where]
+            painted = _painted(part.ravel(), layer, origin, rays[where].reshape(-1, 3), camera.f)
+            image[where] = painted.reshape(part.shape)
+    return image
+
+
+def _near(
+    layer: Layer,
+    reach: Array,
+    a: Array,
+    b: Array,
+    margin: Array,
+) -> Array:
+    """Which of the places on a plane are on the layer or within ``margin`` m of it, and before the camera."""
+    with np.errstate(invalid="ignore"):
+        inside = np.abs(a) < layer.half[0] + margin
+        inside &= np.abs(b) < layer.half[1] + margin
+        return inside & (reach > 0.0) & np.isfinite(reach)
+
+
+def _box(
+    layer: Layer,
+    origin: Array,
+    rays: Array,
+    f: float,
+) -> tuple[slice, slice] | None:
+    """Rows and columns of an image whose rays (h, w, 3) may meet the layer, from every COARSE-th of them."""
+    coarse = rays[::COARSE, ::COARSE]
+    reach, a, b = layer.meet(origin, coarse.reshape(-1, 3))
+    margin = (2.0 * COARSE + REACH * BLUR) / f * reach
+    near = _near(layer, reach, a, b, margin).reshape(coarse.shape[:2])
+    if not near.any():
+        return None
+    return _extent(near.sum(axis=1)), _extent(near.sum(axis=0))
+
+
+def _extent(near: Array) -> slice:
+    """The part of an image, along one axis, around every ``COARSE``-th place that is near."""
+    places = np.flatnonzero(near) * COARSE
+    return slice(max(places[0] - COARSE, 0), places[-1] + 2 * COARSE)
+
+
+def _painted(
+    image: Array,
+    layer: Layer,
+    origin: Array,
+    rays: Array,
+    f: float,
+) -> Array:
+    """A layer before what ``image`` (N,) shows along ``rays`` (N, 3)."""
+    reach, a, b = layer.meet(origin, rays)
+    blur = BLUR / f * reach  # rays have length 1 along the axis: their reach is the depth
+    hit = _near(layer, reach, a, b, REACH * blur)
+    if not hit.any():
+        return image
+    if not hit.all():
+        a = a[hit]
+        b = b[hit]
+        blur = blur[hit]
+    one_blur = blur
+    if np.ptp(blur) < 1e-9 * blur[0]:
+        one_blur = blur[0]
+    own = layer.texture.grey(a, b, one_blur)
+    if np.isfinite(layer.half).any():
+        cover = _covered(a, layer.half[0], blur) * _covered(b, layer.half[1], blur)
+        own = cover * own + (1.0 - cover) * image[hit]
+    result = image.copy()
+    result[hit] = own
+    return result
+
+
+def _covered(place: Array, half: float, blur: Array) -> Array:
+    """Share of the point spread that is within ``half`` of the middle, along one axis."""
+    return ndtr((half - place) / blur) - ndtr((-half - place) / blur)
+
+
+def render_pair(scene: Scene, camera: StereoCamera, pose: Array) -> tuple[Array, Array]:
+    """Left and right image (h, w) without noise, grey values as float."""
+    return render(scene, camera.left, pose), render(scene, camera.right, pose, camera.offset)
+
+
+def digitised(image: Array, noise: float, rng: np.random.Generator) -> Array:
+    """Image (h, w) with Gaussian grey noise of sd ``noise``, as 8-bit."""
+    drawn = rng.standard_normal(image.shape, np.float32)
+    noisy = np.rint(image + np.float32(noise) * drawn)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def film(
+    scene: Scene,
+    camera: StereoCamera,
+    poses: Sequence[Array] | Array,
+    rng: np.random.Generator,
+    noise: float = 3.0,
+    nominal: Sequence[Array] | Array | None = None,
+) -> Iterator[StereoFrame]:
+    """Frames of a scene, with new noise in each; a pose that repeats is rendered once.
+
+    Parameters
+    ----------
+    poses : (F, 6), where the camera is: x, y, z in m, roll, pitch, heading in rad
+    noise : sd of the grey noise of a pixel
+    nominal : (F, 6), where it is said to be; None for ``poses``
+    """
+    if nominal is None:
+        nominal = poses
+    last = np.empty(0)
+    for pose, stated in zip(poses, nominal, strict=True):
+        if not np.array_equal(pose, last):
+            last = pose
+            left, right = render_pair(scene, camera, pose)
+        seen_left = digitised(left, noise, rng)
+        seen_right = digitised(right, noise, rng)
+        yield StereoFrame(seen_left, seen_right, np.asarray(pose), np.asarray(stated))

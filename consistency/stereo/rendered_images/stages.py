@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
+from consistency.stereo.visual_odometry.arrays import opencv
 
 BLOCK = 7  # px, window of the structure tensor
 MARGIN = 12.0  # px from the border, so that the windows of later stages are whole

@@ -13,9 +13,9 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
+from consistency.stereo.visual_odometry.arrays import opencv
 from consistency.stereo.visual_odometry.relative_pose import cross_matrix
+from consistency.stereo.visual_odometry.rig import StereoRig, is_rectified
 
 COUNT = 3000  # strongest features of an image; at 1226 x 370 px that is nearly all of them
 GREY = np.array([0.299, 0.587, 0.114])  # ITU-R BT.601 weights of red, green and blue

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.lie_groups import propagated
+from consistency.referee.geometry import propagated
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.relative_motion import (
@@ -70,7 +70,7 @@ def trajectory(motions: Sequence[RelativeMotion]) -> tuple[Array, Array, Array]:
     R : (T + 1, 3, 3)
     t : (T + 1, 3), m
     P : (T + 1, 6, 6), of the position and of the rotation vector of R_true R' about the first frame's axes (error
-        convention so3 of ``consistency.referee.geometry.conventions``), m and rad; 0 for the first pose. Rotation
+        convention so3 of ``consistency.referee.geometry``), m and rad; 0 for the first pose. Rotation
         vectors have no gimbal lock, which Euler angles in camera axes have where a car turns by 90 degrees.
     """
     R = [np.eye(3)]
@@ -94,7 +94,7 @@ def trajectory(motions: Sequence[RelativeMotion]) -> tuple[Array, Array, Array]:
 def motion_covariances(motions: Sequence[RelativeMotion]) -> Array:
     """Covariances (T, 6, 6) of the motions, of position and rotation vector in the frame that each begins in.
 
-    Error convention so3 of ``consistency.referee.geometry.conventions``, m and rad.
+    Error convention so3 of ``consistency.referee.geometry``, m and rad.
     """
     G = np.zeros((len(motions), 6, 6))
     G[:, :3, :3] = np.eye(3)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.cameras import arrays
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, DegenerateError
+from consistency.stereo.visual_odometry import arrays
+from consistency.stereo.visual_odometry.arrays import ConsensusError, DegenerateError
 from consistency.stereo.visual_odometry.relative_pose import AXES, RelativePose
 
 ON_A_LINE = 1e-8  # second singular value of a cloud, over its largest coordinate, up to which it is a line

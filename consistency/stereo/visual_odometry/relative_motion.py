@@ -10,10 +10,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
-from consistency.stereo.visual_odometry.cameras.camera_pair import in_px
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, MatchError
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulable, triangulate
-from consistency.stereo.visual_odometry.covariance_propagation import registration_covariance, triangulation_covariance
+from consistency.stereo.visual_odometry.arrays import ConsensusError, MatchError
 from consistency.stereo.visual_odometry.features import (
     COUNT,
     EPIPOLAR_PX,
@@ -25,7 +22,12 @@ from consistency.stereo.visual_odometry.features import (
     sift,
     stereo_matches,
 )
-from consistency.stereo.visual_odometry.maximum_likelihood import Refined, refine_reprojection
+from consistency.stereo.visual_odometry.maximum_likelihood import (
+    Refined,
+    refine_reprojection,
+    registration_covariance,
+    triangulation_covariance,
+)
 from consistency.stereo.visual_odometry.registration import register_horn, register_svd, squared_distances
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
 from consistency.stereo.visual_odometry.resection import (
@@ -34,6 +36,7 @@ from consistency.stereo.visual_odometry.resection import (
     resect_ransac,
     squared_reprojections,
 )
+from consistency.stereo.visual_odometry.rig import StereoRig, in_px, triangulable, triangulate
 
 ESTIMATORS = ("reprojection", "svd", "horn")
 FEWEST = 8  # closed circles; below, RANSAC would agree with anything

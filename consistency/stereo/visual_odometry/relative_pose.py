@@ -12,10 +12,10 @@ import numpy as np
 
 from consistency.referee import geometry
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.lie_groups import propagated
+from consistency.referee.geometry import propagated
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras import arrays
-from consistency.stereo.visual_odometry.cameras.input_errors import GimbalLockError
+from consistency.stereo.visual_odometry import arrays
+from consistency.stereo.visual_odometry.arrays import GimbalLockError
 
 LOCKED = 1e-6  # cosine of the pitch below which six digits of roll and yaw are left
 

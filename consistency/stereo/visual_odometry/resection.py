@@ -10,12 +10,11 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.input_errors import ConsensusError, opencv
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, triangulate
-from consistency.stereo.visual_odometry.covariance_propagation import triangulation_covariance
+from consistency.stereo.visual_odometry.arrays import ConsensusError, opencv
+from consistency.stereo.visual_odometry.maximum_likelihood import PixelMatches, triangulation_covariance
 from consistency.stereo.visual_odometry.registration import draw_triples, draws_for, fewest
 from consistency.stereo.visual_odometry.relative_pose import RelativePose
-from consistency.stereo.visual_odometry.two_frame_cost import PixelMatches
+from consistency.stereo.visual_odometry.rig import StereoRig, triangulate
 
 ROUND = 32  # draws at once
 MOST = 1024  # draws at most; finds CONFIDENCE from a share of inliers of 19 % on

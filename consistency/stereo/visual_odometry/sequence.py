@@ -15,10 +15,16 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, is_file, read_text, reading
 from consistency.referee.readers.formats.kitti_files import NANO, place_of, read_times
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import PairCalibration, Rectification, in_px, rectify
-from consistency.stereo.visual_odometry.cameras.input_errors import opencv
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig, is_rectified
+from consistency.stereo.visual_odometry.arrays import opencv
+from consistency.stereo.visual_odometry.calibration_files import read_calibration
+from consistency.stereo.visual_odometry.rig import (
+    PairCalibration,
+    Rectification,
+    StereoRig,
+    in_px,
+    is_rectified,
+    rectify,
+)
 
 BothSides: TypeAlias = tuple[list[Path], list[Path]]  # images of the left and of the right camera
 FORMATS = ("kitti", "kitti-raw", "euroc", "opencv")

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.imperfect_truth import shared_errors
-from consistency.referee.diagnostics.imperfect_truth.shared_errors import SharedError as SharedError
+from consistency.referee.diagnostics.questions import uncertain_truth
+from consistency.referee.diagnostics.questions.uncertain_truth import SharedError as SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.cameras.rig import StereoRig
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
 from consistency.stereo.visual_odometry.odometry import neighbours
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
 from consistency.stereo.visual_odometry.relative_pose import RelativePose, cross_matrix
 from consistency.stereo.visual_odometry.resection import diagonal_covariances
+from consistency.stereo.visual_odometry.rig import StereoRig
 
 # What is shared, and the standard deviation of its prior
 SHARED = {
@@ -94,7 +94,7 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    return shared_errors.fit_shared(errors, J, S, np.array(list(SHARED.values())))
+    return uncertain_truth.fit_shared(errors, J, S, np.array(list(SHARED.values())))
 
 
 def _twist(pose: RelativePose) -> Array:

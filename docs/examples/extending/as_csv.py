@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import io
 
-from consistency.referee.document.blocks import Document, Table
-from consistency.referee.document.wording import PLAIN, written
+from consistency.referee.document.blocks import PLAIN, Document, Table, written
 
 
 def render(document: Document) -> str:

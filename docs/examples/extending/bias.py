@@ -6,9 +6,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from consistency.bench.scenario.effects.effect import ListedEffect, register_effect
-from consistency.bench.scenario.effects.observations import Context, Observations
-from consistency.bench.scenario.tables.toml_tables import Triple
+from consistency.bench.scenario.observations import Context, ListedEffect, Observations, register_effect
+from consistency.bench.scenario.toml_tables import Triple
 
 
 @register_effect

@@ -9,7 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
+from consistency.referee.readers.formats.archives import estimator_of_arrays
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import Estimator
 

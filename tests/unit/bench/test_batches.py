@@ -16,15 +16,13 @@ import pytest
 from misbehaving import Deadly, Still
 
 import consistency as cs
-from consistency.bench.runs import executor_batches
+from consistency.bench.runs import workers
 from consistency.bench.runs.backends.choose_executor import executor_for
-from consistency.bench.runs.executor_batches import BatchResult, ExecutorWorkers, do_batch, failed
-from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_workers import LocalThreads
-from consistency.bench.runs.run_outcome import RunOutcome
-from consistency.bench.runs.trial_work import Recorded, Simulated, TrialWork
+from consistency.bench.runs.isolation import Isolation
+from consistency.bench.runs.run_outcome import Recorded, RunOutcome, Simulated, TrialWork
+from consistency.bench.runs.workers import BatchResult, ExecutorWorkers, LocalThreads, do_batch, failed
 from consistency.bench.store.results import open_results
-from consistency.referee.system.provenance import this_machine
+from consistency.referee.system.folders import this_machine
 from consistency.types import Failure
 
 RUNS = 40
@@ -34,7 +32,7 @@ HERE = {"cpu": "abacus", "blas": "beads"}
 def result(runs, **changes):
     """Of trials that leave nothing but their number."""
     outcomes = [RunOutcome(run, {}, None, ()) for run in runs]
-    return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, executor_batches.versions_here()), **changes)
+    return replace(BatchResult(pickle.dumps(outcomes), "host", HERE, workers.versions_here()), **changes)
 
 
 class Killed(Exception):
@@ -85,7 +83,7 @@ class Fake(Executor):
             return finished.get(timeout=5.0)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(executor_batches, "_next_of", next_of)
+            patch.setattr(workers, "_next_of", next_of)
             yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 
@@ -189,22 +187,22 @@ def test_what_is_not_done_is_cancelled(work):
 
 @pytest.mark.parametrize("name", ["numpy", "filter-consistency", "Python"])
 def test_other_versions_are_refused(work, name):
-    older = Fake(versions=executor_batches.versions_here() | {name: "0.1"})
+    older = Fake(versions=workers.versions_here() | {name: "0.1"})
     with pytest.raises(cs.InputError, match=rf"the worker on host has {name} 0.1, here it is .*; install the same"):
         done(older, work)
 
 
 def test_all_that_the_bits_depend_on_is_compared():
-    assert set(executor_batches.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
+    assert set(workers.versions_here()) == {"filter-consistency", "Python", "numpy", "scipy", "numba"}
 
 
 def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monkeypatch):
     def own():
-        return str(executor_batches.versions_here.__wrapped__()["filter-consistency"])
+        return str(workers.versions_here.__wrapped__()["filter-consistency"])
 
-    assert Path(cs.__file__).parent == executor_batches.PACKAGE
-    assert executor_batches.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
-    monkeypatch.setattr(executor_batches, "PACKAGE", tmp_path)
+    assert Path(cs.__file__).parent == workers.PACKAGE
+    assert workers.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
+    monkeypatch.setattr(workers, "PACKAGE", tmp_path)
     seen = [own()]
     for room in ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
         (tmp_path / room / "inner").mkdir(parents=True)
@@ -324,7 +322,7 @@ def test_the_manifest_has_the_machines_that_did_runs(xyz, tmp_path, capsys, monk
     with ThreadPoolExecutor(1) as executor:
         assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [here]
         with monkeypatch.context() as patch:
-            patch.setattr(executor_batches, "this_machine", lambda: HERE)
+            patch.setattr(workers, "this_machine", lambda: HERE)
             assert cs.run_trials(xyz, still, 3, executor=executor).manifest["machines"] == [HERE]  # and not this one
             cs.run_trials(xyz, still, 3, out=out, executor=executor)
     assert open_results(out).manifest["machines"] == [HERE]

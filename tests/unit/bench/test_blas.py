@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from consistency.bench.filters.kernel import blas
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_rows
+from consistency.bench.filters.kernel import linalg
+from consistency.bench.filters.kernel.update_steps import add_gram_to_state, gather_rows
 
 SIZES = [(1, 1), (3, 7), (36, 174), (50, 9)]
 
@@ -39,32 +39,32 @@ def test_every_routine_against_scipy(m, n, rng):
     S = A @ A.T + 0.1 * np.eye(m)
     root = scipy.linalg.cholesky(S)
     U = upper(S)
-    assert blas.upper_cholesky(U)
+    assert linalg.upper_cholesky(U)
     assert np.allclose(np.triu(U), root, rtol=1e-12, atol=1e-12)
-    for solve, trans in ((blas.solve_upper, 0), (blas.solve_transposed, 1)):
+    for solve, trans in ((linalg.solve_upper, 0), (linalg.solve_transposed, 1)):
         X = padded(B)
         solve(U, X)
         assert np.allclose(X, scipy.linalg.solve_triangular(root, B, trans=trans), rtol=1e-9, atol=1e-9)
         assert surroundings_untouched(X)
     symmetric = rng.normal(size=(n, n))
     C = upper(symmetric)
-    blas.add_gram(-0.7, padded(B), C)
+    linalg.add_gram(-0.7, padded(B), C)
     assert np.allclose(np.triu(C), np.triu(symmetric - 0.7 * B.T @ B), rtol=1e-12, atol=1e-12)
     assert np.isnan(C[np.tril_indices(n, -1)]).all()
     D = padded(np.full((n, m + 3), np.inf))  # what was there does not matter
-    blas.product_of_transposed(padded(B), padded(A), D)
+    linalg.product_of_transposed(padded(B), padded(A), D)
     assert np.allclose(D, B.T @ A, rtol=1e-12, atol=1e-12)
     assert surroundings_untouched(D)
     x, y = rng.normal(size=n), rng.normal(size=(m, 5))
     z = x.copy()
-    blas.add_transposed_times(padded(B), y[:, 2], z)
+    linalg.add_transposed_times(padded(B), y[:, 2], z)
     assert np.allclose(z, x + B.T @ y[:, 2], rtol=1e-12, atol=1e-12)
 
 
 def test_an_indefinite_matrix_has_no_root(rng):
     S = np.eye(5)
     S[3, 3] = -1.0
-    assert not blas.upper_cholesky(upper(S))
+    assert not linalg.upper_cholesky(upper(S))
 
 
 def test_rows_of_half_a_covariance(rng):

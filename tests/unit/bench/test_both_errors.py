@@ -11,21 +11,18 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.bench.filters.run_filter import run_filter, step_through
-from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.results_to_records import record_of, results_source
-from consistency.bench.runs.run_until_decided import run_until_decided
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs
+from consistency.bench.runs.montecarlo import run_until_decided
+from consistency.bench.runs.results_to_records import analyse, mean_nees_of_runs, record_of, results_source
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval
 from consistency.referee.diagnostics.verdict.verdict import MapScore
-from consistency.referee.document.judged_filters import document
-from consistency.referee.document.map import map_text
-from consistency.referee.gating.checked_arrays import record_of_filter
+from consistency.referee.document.tables import document, map_text
+from consistency.referee.gating.checked_input import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
-from consistency.referee.verdicts.baselines import baseline
+from consistency.referee.verdicts.compare_sources import baseline
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]

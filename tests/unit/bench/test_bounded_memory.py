@@ -13,13 +13,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
-from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.results_to_records import analyse, record_of
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Record, Settings, judge, summary
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
-from consistency.referee.document.judged_filters import document
+from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
 
 STEPS = 200
@@ -122,9 +121,9 @@ print(most() - before)
 READ = "from consistency.bench.store.results import open_results\n"
 WORK = {
     "analyse": READ
-    + "from consistency.bench.runs.analyse_results import analyse\nwork = lambda f: analyse(open_results(f))",
+    + "from consistency.bench.runs.results_to_records import analyse\nwork = lambda f: analyse(open_results(f))",
     "report": "from consistency.bench.pages.results_report import build_report as work",
-    "baseline": "from consistency.referee.verdicts.baselines import baseline\n"
+    "baseline": "from consistency.referee.verdicts.compare_sources import baseline\n"
     + "from consistency.bench.runs.results_to_records import results_source\n"
     + "work = lambda f: baseline(results_source(f), str(f))",
 }

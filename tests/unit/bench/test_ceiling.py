@@ -8,7 +8,7 @@ import pytest
 import consistency
 import consistency as cs
 from consistency.bench import filters
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 
 ceiling = sibling(str(Path(consistency.__file__).parents[1] / "experiments" / "e16.py"), "e17_ceiling")
 

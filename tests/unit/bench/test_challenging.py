@@ -15,32 +15,33 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.challenging import world_scores as scoring
+from consistency.bench.challenging import challenge as scoring
 from consistency.bench.challenging.challenge import (
     BASES,
+    BATCH,
+    RUNGS,
+    WORST,
+    Budget,
     ChallengePhases,
+    ChallengeScorer,
+    Done,
     Plan,
+    ScoredWorld,
     base_of,
     challenge,
     challenge_data,
     challenge_lines,
     is_overconfident,
-    write_scenario,
-)
-from consistency.bench.challenging.world_scores import WORST, ChallengeScorer, Done, score_of_run
-from consistency.bench.challenging.world_space import Choice, LogScale, Point, space_of
-from consistency.bench.challenging.worst_point_search import (
-    BATCH,
-    RUNGS,
-    Budget,
-    ScoredWorld,
     ranked,
+    score_of_run,
     search,
     standard_error,
+    write_scenario,
 )
-from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.challenging.world_space import Choice, LogScale, Point, space_of
+from consistency.bench.runs.isolation import Isolation
 from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.path import lap_length, planned_path
+from consistency.bench.simulation.world import lap_length, planned_path
 from consistency.commands import main
 from consistency.referee.errors import InputError
 

@@ -7,8 +7,7 @@ import pytest
 from command import consistency, refused
 
 import consistency as cs
-from consistency.bench.runs.analyse_results import analyse
-from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.runs.results_to_records import analyse, record_of
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 
 RUNS = 40

@@ -12,12 +12,11 @@ from types import SimpleNamespace
 import forks
 import pytest
 
-from consistency.bench.filters.compiler import disk_cache
-from consistency.bench.filters.compiler.content_key import Content
-from consistency.bench.filters.compiler.jit import Kernel, Outlook
-from consistency.bench.filters.resolve_filters import resolve_filters
-from consistency.bench.runs import missing_kernels
-from consistency.bench.runs.experiment_scripts import experiments
+from consistency.bench.filters.compiler import jit
+from consistency.bench.filters.compiler.jit import Content, Kernel, Outlook
+from consistency.bench.filters.run_filter import resolve_filters
+from consistency.bench.runs import run_outcome
+from consistency.bench.runs.reproduce_findings import experiments
 from consistency.bench.scenario import load_scenario
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="kernels are compiled side by side on Linux")
@@ -166,33 +165,33 @@ def test_kernels_of_root_serve_other_users(done, folder, monkeypatch):
     out, err = done("nobody")
     assert out == "3.0 6.0 9.0 0 0 0"  # root's own cache is not for others to read
     assert "Permission denied" in err
-    disk_cache.folder().chmod(0o755)
-    for path in disk_cache.folder().glob("*.kernel"):
+    jit.folder().chmod(0o755)
+    for path in jit.folder().glob("*.kernel"):
         path.chmod(0o644)
-    before = sorted(disk_cache.folder().iterdir())
+    before = sorted(jit.folder().iterdir())
     assert done("nobody") == ("3.0 6.0 9.0 1 1 1", "")
-    for path in disk_cache.folder().glob("*.kernel"):
+    for path in jit.folder().glob("*.kernel"):
         path.unlink()
     out, err = done("nobody")
     assert out == "3.0 6.0 9.0 0 0 0"
     assert err.count("is not kept") == 1
-    assert {*before} - {*disk_cache.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
+    assert {*before} - {*jit.folder().iterdir()} == {path for path in before if path.suffix == ".kernel"}
 
 
 def test_what_others_cannot_read_is_compiled_here(capsys):
     made = []
     outlook = Outlook("", is_ready=False, is_shared=False, size=4)
     mine = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
-    need = missing_kernels.Need(mine, None, None, outlook)  # type: ignore[arg-type]
-    missing_kernels._compile([need, need], 2)
+    need = run_outcome.Need(mine, None, None, outlook)  # type: ignore[arg-type]
+    run_outcome._compile([need, need], 2)
     assert made == [1, 1]
     assert capsys.readouterr().err == "compiling 2 kernels of mine, once: 10 to 60 s for each\n"
 
 
 def test_a_few_filters_are_named():
     needs = [SimpleNamespace(filter=SimpleNamespace(name=name)) for name in "abcde"]
-    assert missing_kernels._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
-    assert missing_kernels._label(needs[:1]) == "compiling the kernel of a"
+    assert run_outcome._label(needs) == "compiling 5 kernels of a, b, c and 2 more"
+    assert run_outcome._label(needs[:1]) == "compiling the kernel of a"
 
 
 # --- the size ---------------------------------------------------------------------------------------
@@ -239,10 +238,10 @@ def test_the_largest_kernel_is_compiled_first(monkeypatch):
 
         def shutdown(self, **_): ...
 
-    monkeypatch.setattr(missing_kernels, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(missing_kernels, "_pickled", lambda need: need.outlook.size)
+    monkeypatch.setattr(run_outcome, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(run_outcome, "_pickled", lambda need: need.outlook.size)
     needs = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
-    missing_kernels._compile_side_by_side(needs, 2)
+    run_outcome._compile_side_by_side(needs, 2)
     assert begun == [3, 2, 1]
 
 

@@ -15,10 +15,10 @@ from numba.core.types import functions
 
 import consistency as cs
 from consistency.bench.filters.compiler import jit
-from consistency.bench.filters.compiler.whole_program import remembered_types
-from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_workers import LocalThreads
-from consistency.bench.runs.trial_work import Simulated, TrialWork
+from consistency.bench.filters.compiler.jit import remembered_types
+from consistency.bench.runs.isolation import Isolation
+from consistency.bench.runs.run_outcome import Simulated, TrialWork
+from consistency.bench.runs.workers import LocalThreads
 from consistency.bench.simulation.world import World
 
 stack = targetconfig.ConfigStack
@@ -50,7 +50,7 @@ def counted(monkeypatch, owner, name):
 @pytest.fixture
 def asked(monkeypatch):
     """Calls whose type Numba has looked for."""
-    monkeypatch.setattr("consistency.bench.filters.compiler.whole_program._known", {})
+    monkeypatch.setattr("consistency.bench.filters.compiler.jit._known", {})
     return counted(monkeypatch, functions.BaseFunction, "get_call_type")
 
 

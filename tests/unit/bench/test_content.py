@@ -17,9 +17,8 @@ import pytest
 from numba.core import config
 from numba.core.registry import cpu_target
 
-from consistency.bench.filters.compiler import content_key, dispatch
-from consistency.bench.filters.compiler.content_key import Content
-from consistency.bench.filters.compiler.jit import Kernel
+from consistency.bench.filters.compiler import dispatch, jit
+from consistency.bench.filters.compiler.jit import Content, Kernel
 
 SCRIPT = """
 import sys
@@ -169,7 +168,7 @@ def key(monkeypatch):
     def of(module="rules", old="", new="", kind="Single"):
         assert not old or TEXTS[module].count(old) == 1
         parts = {}
-        for owner, name in ((dispatch, "PARTS"), (content_key, "PARTS"), (dispatch, "_named_bodies")):
+        for owner, name in ((dispatch, "PARTS"), (jit, "PARTS"), (dispatch, "_named_bodies")):
             monkeypatch.setattr(owner, name, parts if name == "PARTS" else {})
         for name, text in TEXTS.items():
             loaded = ModuleType(name)
@@ -218,19 +217,19 @@ def test_what_other_kernels_are_made_of_is_no_content(key):
 def test_settings_are_content(key, monkeypatch, setting):
     before = key()
     monkeypatch.setattr(config, setting, 17)
-    content_key._versions.cache_clear()
+    jit._versions.cache_clear()
     assert key() != before
     monkeypatch.undo()
-    content_key._versions.cache_clear()
+    jit._versions.cache_clear()
 
 
 def test_the_processor_is_content(key, monkeypatch):
     before, codegen = key(), cpu_target.target_context.codegen()
     monkeypatch.setattr(codegen, "magic_tuple", lambda: ("x86_64", "another", ""))
-    content_key._versions.cache_clear()
+    jit._versions.cache_clear()
     assert key() != before
     monkeypatch.undo()
-    content_key._versions.cache_clear()
+    jit._versions.cache_clear()
 
 
 def test_what_cannot_be_compared_is_not_kept(monkeypatch, tmp_path):

@@ -11,12 +11,11 @@ from misbehaving import KINDS, Deadly, Still
 
 import consistency as cs
 from consistency.bench.runs.backends.dask import Client, DaskExecutor
-from consistency.bench.runs.executor_batches import ExecutorWorkers
-from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_workers import LocalThreads
+from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.trial_work import Simulated, TrialWork
-from consistency.referee.system.provenance import this_machine
+from consistency.bench.runs.run_outcome import Simulated, TrialWork
+from consistency.bench.runs.workers import ExecutorWorkers, LocalThreads
+from consistency.referee.system.folders import this_machine
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),

@@ -9,8 +9,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.pages.sections.filters_table import filters_table
-from consistency.bench.runs.experiment_scripts import experiments
-from consistency.bench.runs.reproduce_findings import Study
+from consistency.bench.runs.reproduce_findings import Study, experiments
 from consistency.referee.document.blocks import Status
 
 ROW = {

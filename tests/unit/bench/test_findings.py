@@ -10,7 +10,7 @@ import typer
 
 from consistency import InputError
 from consistency.bench.pages.results_report import build_report, compose
-from consistency.bench.runs import experiment_scripts
+from consistency.bench.runs import reproduce_findings
 from consistency.bench.runs import reproduce_findings as module
 from consistency.bench.runs.reproduce_findings import Study, reproduce
 from consistency.commands.studies import reproduce_command
@@ -40,7 +40,7 @@ def scripts(tmp_path, monkeypatch):
     """Folder of experiments: two that share trials, two in processes of their own, of which one takes long."""
     folder = tmp_path / "experiments"
     folder.mkdir()
-    monkeypatch.setattr(experiment_scripts, "data_folder", lambda _: folder)
+    monkeypatch.setattr(reproduce_findings, "data_folder", lambda _: folder)
     write(folder, 1, ("one", "uno"))
     write(folder, 2, ("two",), "OWN_PROCESS = True")
     write(folder, 3, ("three",), "OWN_PROCESS = True\nLONG = True")

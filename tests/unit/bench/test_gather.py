@@ -20,13 +20,12 @@ import pytest
 from edited import accept_changes, content
 
 import consistency as cs
-from consistency.bench.runs import local_workers, outcomes_to_results, trial_work
-from consistency.bench.runs.run_outcome import RunOutcome, outcome_of
-from consistency.bench.runs.trial_work import TrialWork
+from consistency.bench.runs import outcomes_to_results, run_outcome, workers
+from consistency.bench.runs.run_outcome import RunOutcome, TrialWork, outcome_of
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
-from consistency.referee.document.judged_filters import document
+from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
@@ -153,8 +152,8 @@ def test_few_outcomes_wait_for_their_turn(uvd, tmp_path, monkeypatch):
         most.append(len(alive))
         return outcome
 
-    monkeypatch.setattr(trial_work, "outcome_of", counted)
-    monkeypatch.setattr(local_workers, "AHEAD", 2)
+    monkeypatch.setattr(run_outcome, "outcome_of", counted)
+    monkeypatch.setattr(workers, "AHEAD", 2)
     cs.run_trials(uvd, ["ekf-uvd"], 60, jobs=2, out=tmp_path / "out")
     assert len(most) == 60
     assert max(most) <= 2 * 2 + 2, "those ahead, the one that is written, and the next"
@@ -338,16 +337,16 @@ class Work:
 
 
 def test_what_ends_together_with_an_error_counts(monkeypatch):
-    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
-    outcomes = local_workers.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
+    monkeypatch.setattr(workers, "SimpleQueue", Together)
+    outcomes = workers.LocalThreads(2).outcomes(Work((0, 2)), range(4))  # type: ignore[arg-type]
     assert {next(outcomes), next(outcomes)} == {1, 3}
     with pytest.raises(RuntimeError, match="out of ideas"):
         next(outcomes)
 
 
 def test_what_ends_together_leaves_room_for_as_many(monkeypatch):
-    monkeypatch.setattr(local_workers, "SimpleQueue", Together)
-    outcomes = local_workers.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
+    monkeypatch.setattr(workers, "SimpleQueue", Together)
+    outcomes = workers.LocalThreads(2).outcomes(Work(), range(8))  # type: ignore[arg-type]
     assert sorted(map(int, outcomes)) == list(range(8))  # type: ignore[call-overload]
 
 

@@ -25,9 +25,8 @@ from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
 from consistency.commands.app import app
 from consistency.diagnostics import clustered_share, rejection_score
-from consistency.referee.document.blocks import Name, Table
-from consistency.referee.document.judged_filters import document
-from consistency.referee.document.wording import brief, written
+from consistency.referee.document.blocks import Name, Table, brief, written
+from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
 
 WRONG = [{"kind": "wrong-match", "rate": 0.05}]

@@ -11,10 +11,9 @@ from consistency.bench.pages import sweep_report as heat
 from consistency.bench.pages import write_regime_reports
 from consistency.bench.pages.sweep_report import colour_of, heat_figure, ink_on
 from consistency.bench.sweeps.regime_map import Regime, regime_blocks
-from consistency.bench.sweeps.run_cell import CellResult, plain_numbers, result_from
-from consistency.bench.sweeps.sweep_axes import Axis
-from consistency.bench.sweeps.sweep_file import load_sweep
-from consistency.referee.show.svg import svg
+from consistency.bench.sweeps.run_sweep import CellResult, plain_numbers, result_from
+from consistency.bench.sweeps.sweep_file import Axis, load_sweep
+from consistency.referee.show.figures import svg
 from consistency.referee.show.terminal import show
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]

@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_info
 
 import consistency as cs
 from consistency.bench.filters.run_filter import run_filter
-from consistency.bench.runs.isolation import filter_process
-from consistency.bench.runs.isolation.filter_process import Isolation
+from consistency.bench.runs import isolation as filter_process
+from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import Interrupted
 from consistency.bench.runs.outcomes_to_results import Gathered
 from consistency.bench.runs.run_outcome import outcome_of

@@ -12,10 +12,10 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_outcome import outcome_of
 from consistency.diagnostics import JointNees, Record, Settings, judge
-from consistency.referee.diagnostics.maps.map_nees import joint_nees, joint_test, last_nees
-from consistency.referee.diagnostics.questions.equivalence import is_tolerated
-from consistency.referee.diagnostics.verdict.answers import JOINT, JOINT_DISTRIBUTION
-from consistency.referee.geometry.conventions import planar_error, planar_map_error
+from consistency.referee.diagnostics.questions.maps import joint_nees, joint_test, last_nees
+from consistency.referee.diagnostics.questions.scale import is_tolerated
+from consistency.referee.diagnostics.verdict.parts import JOINT, JOINT_DISTRIBUTION
+from consistency.referee.geometry import planar_error, planar_map_error
 
 RUNS, LANDMARKS = 30, 12
 NUMBER = 3 + 3 * LANDMARKS

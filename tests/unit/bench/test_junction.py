@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.scenario.effects import Context
-from consistency.bench.scenario.effects.occlusion_junctions import Crossings
+from consistency.bench.scenario.effects import Context, Crossings
 from consistency.bench.simulation import World
 from consistency.referee.geometry import rotation
 

@@ -6,7 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from consistency.bench.filters.compiler import disk_cache, jit, whole_program
+from consistency.bench.filters.compiler import jit
+from consistency.bench.filters.compiler import jit as disk_cache
+from consistency.bench.filters.compiler import jit as whole_program
 
 
 def total(n):

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.trial_work import TrialWork as Runs
+from consistency.bench.runs.run_outcome import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.sweeps import run_cell as cells
+from consistency.bench.sweeps import run_sweep as cells
 from consistency.bench.sweeps import run_sweep as sweeping
-from consistency.bench.sweeps.run_cell import cost_of
-from consistency.bench.sweeps.run_sweep import run_sweep
+from consistency.bench.sweeps.run_sweep import SweepFolder, cost_of, run_sweep
 from consistency.bench.sweeps.sweep_file import load_sweep
-from consistency.bench.sweeps.sweep_folder import SweepFolder
 
 GRID = """
 summary = "Three densities in a linear world"
@@ -125,7 +123,7 @@ def test_runs_of_other_inputs_are_dropped(at, stop_after, monkeypatch, old, new)
     monkeypatch.undo()
     monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
     if new == "code":
-        monkeypatch.setattr("consistency.bench.sweeps.sweep_folder.code_digest", lambda: "another")
+        monkeypatch.setattr("consistency.bench.sweeps.run_sweep.code_digest", lambda: "another")
         new = ""
     sweep = grid(at, old, new) if old else grid(at)
     done = stop_after(-1, Killed())

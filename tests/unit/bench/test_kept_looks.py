@@ -8,17 +8,16 @@ import pytest
 from edited import content
 
 import consistency as cs
+from consistency.bench.runs import montecarlo as deciding
 from consistency.bench.runs import outcomes_to_results
-from consistency.bench.runs import run_until_decided as deciding
-from consistency.bench.runs.montecarlo import run_log, simulate_log
+from consistency.bench.runs.montecarlo import run_log, run_until_decided, simulate_log
 from consistency.bench.runs.run_outcome import RunOutcome
-from consistency.bench.runs.run_until_decided import run_until_decided
 from consistency.bench.store.journal import Unfinished
 from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Record
 from consistency.referee.diagnostics import judge_record
-from consistency.referee.document.judged_filters import document
+from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
 
 OPEN = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20

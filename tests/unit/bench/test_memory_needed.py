@@ -3,10 +3,10 @@
 import pytest
 
 import consistency as cs
-from consistency.bench.runs import local_workers as module
-from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_workers import LocalThreads, memory_here, workers_that_fit
-from consistency.bench.runs.trial_work import Recorded, TrialWork
+from consistency.bench.runs import workers as module
+from consistency.bench.runs.isolation import Isolation
+from consistency.bench.runs.run_outcome import Recorded, TrialWork
+from consistency.bench.runs.workers import LocalThreads, memory_here, workers_that_fit
 from consistency.referee.errors import InputError
 
 

@@ -6,13 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.bench.filters.believed_noise import sensor_noise
-from consistency.bench.filters.kernel import unicycle
+from consistency.bench.filters.kernel import part_functions
 from consistency.bench.filters.kernel.part_functions import State
-from consistency.bench.filters.kernel.update_steps import linearise, linearise_at, make_work, observe, place_observed
+from consistency.bench.filters.kernel.update_steps import (
+    linearise,
+    linearise_at,
+    make_work,
+    observe,
+    place_observed,
+)
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import Reference, place_about_reference
 from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians
-from consistency.bench.models import motion, point, stereo
+from consistency.bench.models import motion, observation
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.types import Control
@@ -73,25 +79,25 @@ def test_dead_reckoning_repeats_single_steps(rng):
 
 @given(AHEAD, METRES, METRES)
 def test_projection_jacobian(x, y, z):
-    exact = complex_step(lambda p: stereo.project(*p, F, B), np.array([x, y, z]))
-    assert close(np.reshape(stereo.project_jacobian(x, y, z, F, B), (3, 3)), exact)
+    exact = complex_step(lambda p: observation.project(*p, F, B), np.array([x, y, z]))
+    assert close(np.reshape(observation.project_jacobian(x, y, z, F, B), (3, 3)), exact)
 
 
 @given(PIXELS, PIXELS, DISPARITY)
 def test_triangulation_jacobian(u, v, d):
-    exact = complex_step(lambda p: stereo.triangulate(*p, F, B), np.array([u, v, d]))
-    assert close(np.reshape(stereo.triangulate_jacobian(u, v, d, F, B), (3, 3)), exact)
+    exact = complex_step(lambda p: observation.triangulate(*p, F, B), np.array([u, v, d]))
+    assert close(np.reshape(observation.triangulate_jacobian(u, v, d, F, B), (3, 3)), exact)
 
 
 @given(AHEAD, METRES, METRES)
 def test_triangulation_inverts_projection(x, y, z):
-    back = stereo.triangulate(*stereo.project(x, y, z, F, B), F, B)
+    back = observation.triangulate(*observation.project(x, y, z, F, B), F, B)
     assert np.allclose(back, (x, y, z), rtol=1e-12, atol=1e-12)
 
 
 def test_signs_of_pixels():
     """Left of the axis u < 0, above it v < 0, and the disparity is f B / x."""
-    u, v, d = stereo.project(2.0, 0.5, 0.25, F, B)
+    u, v, d = observation.project(2.0, 0.5, 0.25, F, B)
     assert (u, v, d) == (-37.5, -18.75, F * B / 2.0)
 
 
@@ -100,7 +106,7 @@ def test_published_nominal_pixel():
 
     The text prints d = 1.32 px; with its f = 150 px and B = 0.09 m, f B / x is 1.35 px.
     """
-    u, _, d = stereo.project(10.0, 1.0, 0.0, F, B)
+    u, _, d = observation.project(10.0, 1.0, 0.0, F, B)
     assert abs(u) == pytest.approx(15.0)
     assert d == pytest.approx(1.35)
 
@@ -110,21 +116,21 @@ def test_published_nominal_pixel():
 
 @given(METRES, METRES, ANGLE, METRES, METRES, METRES)
 def test_robot_frame_inverse(px, py, heading, lx, ly, lz):
-    back = point.to_world(px, py, heading, *point.to_robot(px, py, heading, lx, ly, lz))
+    back = observation.to_world(px, py, heading, *observation.to_robot(px, py, heading, lx, ly, lz))
     assert np.allclose(back, (lx, ly, lz), rtol=0, atol=1e-12 * 100)
 
 
 def test_robot_frame_signs():
     """A robot facing world +y: a point further along y is ahead, one at smaller x is to the right."""
-    assert np.allclose(point.to_robot(1.0, 1.0, np.pi / 2, 1.0, 3.0, 0.5), (2.0, 0.0, 0.5))
-    assert np.allclose(point.to_robot(1.0, 1.0, np.pi / 2, 2.0, 1.0, 0.0), (0.0, -1.0, 0.0))
+    assert np.allclose(observation.to_robot(1.0, 1.0, np.pi / 2, 1.0, 3.0, 0.5), (2.0, 0.0, 0.5))
+    assert np.allclose(observation.to_robot(1.0, 1.0, np.pi / 2, 2.0, 1.0, 0.0), (0.0, -1.0, 0.0))
 
 
 @given(METRES, METRES, METRES, ANGLE, st.floats(-1.5, 1.5), ANGLE)
 def test_mount_inverse(x, y, z, roll, pitch, heading):
     mount = Mount(position=(0.3, -0.2, 0.5), rotation=(roll, pitch, heading)).packed()
-    there = point.to_sensor(x, y, z, mount)
-    assert np.allclose(point.from_sensor(*there, mount), (x, y, z), rtol=0, atol=1e-11)
+    there = observation.to_sensor(x, y, z, mount)
+    assert np.allclose(observation.from_sensor(*there, mount), (x, y, z), rtol=0, atol=1e-11)
     assert np.linalg.norm(there) == pytest.approx(np.linalg.norm(np.subtract((x, y, z), mount[:3])), abs=1e-11)
 
 
@@ -167,7 +173,7 @@ def _slam(sensor, uvd):
 def test_kernels_equal_the_textbook_sensor(pose, landmark, uvd, tilted):
     belief = _sensor(tilted)
     sensor, slam = PointSensor(belief, uvd), _slam(belief, uvd)
-    frame, expected = unicycle.robot_frame(pose), sensor.measure(pose, landmark)
+    frame, expected = part_functions.robot_frame(pose), sensor.measure(pose, landmark)
     z, Hp, Hl = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     observe(slam, frame, landmark, z)
     assert close(z, expected)
@@ -209,9 +215,9 @@ def test_converted_noise_is_propagated_to_first_order(rng):
     z = np.column_stack([rng.uniform(-100, 100, (6, 2)), rng.uniform(2, 20, 6)])
     points, R = sensor_noise(z, sensor, converted=True)
     for i, measured in enumerate(z):
-        J = complex_step(lambda p: stereo.triangulate(*p, F, B), measured)
+        J = complex_step(lambda p: observation.triangulate(*p, F, B), measured)
         assert close(R[i], J @ np.diag(np.square(sensor.sigma)) @ J.T)
-        assert close(points[i], np.array(stereo.triangulate(*measured, F, B)))
+        assert close(points[i], np.array(observation.triangulate(*measured, F, B)))
     same, R = sensor_noise(z, sensor, converted=False)
     assert np.array_equal(same, z)
     assert np.array_equal(R, np.broadcast_to(np.diag(np.square(sensor.sigma)), (6, 3, 3)))

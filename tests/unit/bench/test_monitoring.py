@@ -16,11 +16,11 @@ import consistency as cs
 from consistency.bench.runs.results_to_records import innovations_of
 from consistency.referee.document.alarms import monitor_document
 from consistency.referee.errors import InputError
-from consistency.referee.pages.nis_over_time import POINTS, averaged, monitor_drawing
+from consistency.referee.pages.record_figures import POINTS, averaged, monitor_drawing
 from consistency.referee.pages.write_pages import plotted, require_plot
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show.as_json import render
-from consistency.referee.show.svg import drawn, saved, svg
+from consistency.referee.show.figures import drawn, saved, svg
 from consistency.referee.show.terminal import show
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
 

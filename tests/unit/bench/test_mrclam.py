@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 
 SCRIPTS = Path(__file__).parents[3] / "experiments"
 conversion = sibling(str(SCRIPTS / "e15_mrclam.py"), "mrclam_log")

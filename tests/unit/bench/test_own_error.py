@@ -19,7 +19,7 @@ from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import OWN_NUMBERS, joined, open_results
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.column_names import OWN_COVARIANCE, POINT_COVARIANCE
-from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.geometry import planar_error
 from consistency.referee.types import Failure
 
 FILTERS = ["ekf-uvd", Invariant()]

@@ -36,14 +36,13 @@ from consistency.bench.runs.reproduce_findings import Finding
 from consistency.bench.store.results import read_results
 from consistency.diagnostics import Answer, Interval, Record, Settings, judge
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics.verdict.answers import DIRECTION, STEP
-from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.verdict.parts import DIRECTION, STATUSES, STEP
 from consistency.referee.diagnostics.words.numbers import short
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.judged_filters import FURTHER, page, shown_inside
-from consistency.referee.document.wording import written
-from consistency.referee.pages import questions_table, ratio_figures, verdicts
-from consistency.referee.pages.judged_estimators import time_axis_of
+from consistency.referee.document.blocks import Figure, written
+from consistency.referee.document.tables import FURTHER, page, shown_inside
+from consistency.referee.pages import ratio_figures, verdicts
+from consistency.referee.pages import verdicts as questions_table
+from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.show import as_html, pdf
 from consistency.referee.types import Failure
 

@@ -1,7 +1,7 @@
 """Looks while the runs come."""
 
 import consistency as cs
-from consistency.bench.runs.run_until_decided import run_until_decided
+from consistency.bench.runs.montecarlo import run_until_decided
 
 FAULTY, OPEN = "ekf-xyz", "ekf-uvd"  # points from stereo as Gaussian: a gross fault; pixels: none that few runs show
 PLAN = {"false_alarm": 1e-6, "max_runs": 40, "seed": 11}

@@ -8,11 +8,10 @@ from misbehaving import Deadly, is_gone
 import consistency as cs
 from consistency.bench.runs.backends import slurm
 from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
-from consistency.bench.runs.executor_batches import ExecutorWorkers
-from consistency.bench.runs.isolation.filter_process import Isolation
-from consistency.bench.runs.local_workers import LocalThreads
+from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
-from consistency.bench.runs.trial_work import Simulated, TrialWork
+from consistency.bench.runs.run_outcome import Simulated, TrialWork
+from consistency.bench.runs.workers import ExecutorWorkers, LocalThreads
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),

@@ -10,18 +10,24 @@ import pandas as pd
 import pytest
 
 import consistency as cs
-from consistency.bench.runs.run_until_decided import run_until_decided
+from consistency.bench.runs.montecarlo import run_until_decided
 from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.truth_and_belief import with_changes
-from consistency.bench.sweeps import run_cell as cells
+from consistency.bench.sweeps import run_sweep as cells
+from consistency.bench.sweeps import run_sweep as folders
 from consistency.bench.sweeps import run_sweep as sweeping
-from consistency.bench.sweeps import sweep_folder as folders
 from consistency.bench.sweeps.regime_map import Regime, ranked_by_cost, read_regime, regime_of, write_regime
-from consistency.bench.sweeps.run_cell import CellResult, cost_of, run_cell
-from consistency.bench.sweeps.run_sweep import run_sweep
-from consistency.bench.sweeps.sweep_axes import QUANTITIES
-from consistency.bench.sweeps.sweep_file import load_sweep, number_of_points, sweep_names
-from consistency.bench.sweeps.sweep_folder import CellWork, SweepFolder, describe, sweep_from
+from consistency.bench.sweeps.run_sweep import (
+    CellResult,
+    CellWork,
+    SweepFolder,
+    cost_of,
+    describe,
+    run_cell,
+    run_sweep,
+    sweep_from,
+)
+from consistency.bench.sweeps.sweep_file import QUANTITIES, load_sweep, number_of_points, sweep_names
 from consistency.referee.errors import InputError
 
 LINEAR = """

@@ -16,11 +16,23 @@ import consistency as cs
 from consistency.bench.filters.filter_declarations import problem_of
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.store.recorded_log import Log
-from consistency.bench.tuning.fit_and_verdict_trials import part_of, parts_of
-from consistency.bench.tuning.innovation_likelihood import BeliefScorer, score_of_run_by_innovations
-from consistency.bench.tuning.noise_groups import noise_groups_of, rounded, scaled, sigma_by_channel
-from consistency.bench.tuning.tune import MOST_TOLERATED, tolerant
-from consistency.bench.tuning.tuning_result import factor_text, tuning_data, tuning_lines
+from consistency.bench.tuning.noise_factor_fit import (
+    BeliefScorer,
+    noise_groups_of,
+    rounded,
+    scaled,
+    score_of_run_by_innovations,
+    sigma_by_channel,
+)
+from consistency.bench.tuning.tune import (
+    MOST_TOLERATED,
+    factor_text,
+    part_of,
+    parts_of,
+    tolerant,
+    tuning_data,
+    tuning_lines,
+)
 from consistency.commands import main
 from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.verdict.parts import Interval
@@ -408,7 +420,7 @@ def test_one_robot_of_mrclam():
     folder = Path(os.environ.get("CONSISTENCY_DATA", "")) / "mrclam" / "MRCLAM_Dataset6"
     if not os.environ.get("CONSISTENCY_DATA") or not folder.is_dir():
         pytest.skip("set CONSISTENCY_DATA to the folder that holds mrclam/MRCLAM_Dataset6")
-    from consistency.bench.runs.experiment_scripts import sibling
+    from consistency.bench.runs.reproduce_findings import sibling
 
     conversion = sibling(str(Path(__file__).parents[3] / "experiments/e15_mrclam.py"), "mrclam_log")
     trial, belief, _, _ = conversion.log_of(conversion.read_robot(folder, 3))

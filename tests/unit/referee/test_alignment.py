@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 import consistency as cs
 from consistency.commands.app import app
 from consistency.diagnostics import Record, Settings, judge
-from consistency.referee.diagnostics.imperfect_truth import residuals_of_fit
-from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
+from consistency.referee.diagnostics.questions import residuals_of_fit
+from consistency.referee.diagnostics.questions.residuals_of_fit import (
     _at_most,
     _binned,
     _bins,
@@ -29,14 +29,24 @@ from consistency.referee.diagnostics.imperfect_truth.residuals_of_fit import (
     inflation_of_mean,
     left_covariances,
 )
-from consistency.referee.diagnostics.questions.equivalence import equivalence
-from consistency.referee.diagnostics.verdict.answers import BIAS
+from consistency.referee.diagnostics.questions.scale import equivalence
+from consistency.referee.diagnostics.verdict.parts import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
-from consistency.referee.readers.alignment import residuals
-from consistency.referee.readers.alignment.frame_fit import frame_of_least_nees, orthonormal, sound_of, tangent
-from consistency.referee.readers.alignment.residuals import ALL_BUT_SCALE, FREE, Aligned, aligned, clocks_and_frames
-from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.readers import alignment as residuals
+from consistency.referee.readers.alignment import (
+    ALL_BUT_SCALE,
+    FREE,
+    Aligned,
+    WorldTransform,
+    aligned,
+    clocks_and_frames,
+    frame_of_least_nees,
+    moved,
+    orthonormal,
+    sound_of,
+    tangent,
+)
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses
 

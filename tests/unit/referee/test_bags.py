@@ -244,7 +244,7 @@ def test_fixes_against_fixes(tmp_path):
     """NEES in the plane of the first true place; without a fix a message does not count."""
     from test_fixes import flight, plane
 
-    from consistency.referee.readers.formats.geodetic import axes_at
+    from consistency.referee.readers.formats.positions import axes_at
 
     place, C = flight()
     off = place + np.random.default_rng().normal(size=place.shape) * [5e-7, 5e-7, 0.05]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from referee import judge
 
-from consistency.referee.diagnostics.records import large_arrays
+from consistency.referee.diagnostics.records import whitening
 from consistency.referee.types import Failure
 
 RUNS, STEPS = 61, 23
@@ -55,8 +55,8 @@ def test_blocks_do_not_change_the_verdict(rng, monkeypatch, bias, gaps, size):
                 arrays[name][failure.run, failure.step - 1 :] = np.nan
     whole = verdicts(arrays, failures=failures)
     before = {name: array.copy() for name, array in arrays.items()}
-    monkeypatch.setattr(large_arrays, "ROWS", size)
-    monkeypatch.setattr(large_arrays, "FEWER", size)
+    monkeypatch.setattr(whitening, "ROWS", size)
+    monkeypatch.setattr(whitening, "FEWER", size)
     for a, b in zip(whole, verdicts(arrays, failures=failures), strict=True):
         assert (a.status, a.reasons) == (b.status, b.reasons)
         equal(a.statistics, b.statistics)
@@ -81,8 +81,8 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(rng, monkeypatch):
     judge("f", **arrays)  # loads modules, which are not measured
     peaks = []
     for rows in (1000, 10**9):  # the second is the negative control
-        monkeypatch.setattr(large_arrays, "ROWS", rows)
-        monkeypatch.setattr(large_arrays, "FEWER", rows)
+        monkeypatch.setattr(whitening, "ROWS", rows)
+        monkeypatch.setattr(whitening, "FEWER", rows)
         tracemalloc.start()
         try:
             assert judge("f", **arrays).status == "overconfident"
@@ -94,7 +94,7 @@ def test_a_verdict_needs_less_memory_than_its_arrays_hold(rng, monkeypatch):
 
 @pytest.mark.parametrize("count, each", [(0, 5), (1, 5), (10, 0), (10, 3), (10, 10**9)])
 def test_slices_cover_everything_once(monkeypatch, count, each):
-    monkeypatch.setattr(large_arrays, "ROWS", 7)
-    slices = list(large_arrays.block_slices(count, each))
+    monkeypatch.setattr(whitening, "ROWS", 7)
+    slices = list(whitening.block_slices(count, each))
     assert slices
     assert [k for here in slices for k in range(count)[here]] == list(range(count))

@@ -20,8 +20,8 @@ import consistency as cs
 from consistency.bench.store.parquet import read_parquet
 from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
-from consistency.referee.system.shipped import data_folder
-from consistency.referee.verdicts.baselines import read_baseline
+from consistency.referee.system.folders import data_folder
+from consistency.referee.verdicts.compare_sources import read_baseline
 
 
 def read(path, **options):
@@ -147,7 +147,7 @@ def test_complex_numbers_are_refused(files, key):
 
 
 def test_a_singular_matrix_of_a_camera_is_named(files):
-    from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
+    from consistency.stereo.visual_odometry.calibration_files import read_calibration
 
     path = files / "kitti" / "calib.txt"
     path.write_text(path.read_text(encoding="utf-8").replace("P1: 700", "P1: 0"), encoding="utf-8")
@@ -172,7 +172,7 @@ def test_a_singular_matrix_of_a_camera_is_named(files):
 def test_yaml_that_is_hostile(tmp_path, text, said):
     pytest.importorskip("yaml")
     pytest.importorskip("cv2")
-    from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
+    from consistency.stereo.visual_odometry.calibration_files import read_calibration
 
     path = tmp_path / "c.yaml"
     path.write_text(text, encoding="utf-8")

@@ -23,7 +23,7 @@ from scipy import stats
 import consistency as cs
 from consistency.diagnostics import nis_of
 from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.geometry.conventions import planar_error
+from consistency.referee.geometry import planar_error
 
 ROOT = Path(__file__).parents[3]
 TABLE = json.loads((ROOT / "reports/reference/calibration.json").read_text(encoding="utf-8"))

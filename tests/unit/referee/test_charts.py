@@ -6,16 +6,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.geometry.lie_groups import (
-    from_left,
-    inverse,
-    log,
-    matrices,
-    spatial_error,
-    state_error,
-    to_left,
-)
-from consistency.referee.readers.alignment.world_frames import WorldTransform, moved
+from consistency.referee.geometry import from_left, inverse, log, matrices, spatial_error, state_error, to_left
+from consistency.referee.readers.alignment import WorldTransform, moved
 from consistency.referee.readers.truth_matching import Poses
 
 SIGMA = np.array([0.02, 0.05, 0.03, 0.05, 0.02, 0.08])  # x, y, z, and three of the rotation

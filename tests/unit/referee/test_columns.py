@@ -11,6 +11,12 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.referee.readers.formats.columns import (
+    OWN,
+    PLAIN,
+    TRUE,
+    Clock,
+    alike,
+    clock_of,
     covariance_columns,
     pose_columns,
     rates_in,
@@ -19,7 +25,6 @@ from consistency.referee.readers.formats.columns import (
 )
 from consistency.referee.readers.formats.restated import text_files
 from consistency.referee.readers.formats.sheet import read_sheet
-from consistency.referee.readers.formats.spellings import OWN, PLAIN, TRUE, Clock, alike, clock_of
 from consistency.referee.readers.formats.table_columns import with_clock
 from consistency.referee.readers.options import Reading
 

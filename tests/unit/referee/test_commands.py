@@ -17,8 +17,7 @@ from documents import parsed
 import consistency as cs
 from consistency.bench import filters
 from consistency.bench.sweeps.sweep_file import load_sweep
-from consistency.commands.app import app
-from consistency.commands.registry import COMMANDS
+from consistency.commands.app import COMMANDS, app
 from consistency.commands.shared_options import print_next
 from consistency.referee import extras
 from consistency.referee.extras import (
@@ -30,7 +29,7 @@ from consistency.referee.extras import (
     require,
     requirements,
 )
-from consistency.referee.system.shipped import summaries
+from consistency.referee.system.folders import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -313,7 +312,7 @@ except SystemExit as end:
 print(*sorted(name for name in sys.modules if name.startswith("consistency.commands.")))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    names = ["app", "judging", "registry", "shared_options"]
+    names = ["app", "judging", "shared_options"]
     assert done.stdout.splitlines()[-2:] == ["None", " ".join(f"consistency.commands.{name}" for name in names)]
 
 

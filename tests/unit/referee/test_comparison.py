@@ -15,11 +15,16 @@ from scipy import optimize, special, stats
 import consistency as cs
 from consistency.bench.runs.results_to_records import results_source
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
-from consistency.referee.diagnostics.statistics.mean_nees_ratio import Contrast, contrast, margin
-from consistency.referee.gating.gate_terms import RunningTest, watching
-from consistency.referee.gating.session_ledger import needed_at
-from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
-from consistency.referee.verdicts.compare_sources import Compared, compare_filters, compare_with
+from consistency.referee.diagnostics.statistics.nees import Contrast, contrast, margin
+from consistency.referee.gating.session import RunningTest, needed_at, watching
+from consistency.referee.verdicts.compare_sources import (
+    Compared,
+    baseline,
+    compare_filters,
+    compare_with,
+    read_baseline,
+    write_baseline,
+)
 from consistency.testing import InsufficientTrials, assert_not_worse
 
 RATE = 1e-5  # false-failure rate of each statistical assertion below

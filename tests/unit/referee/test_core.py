@@ -78,10 +78,10 @@ print(*(name.removeprefix("consistency.referee.") for name in sys.modules if nam
     assert len(ours) <= 79
     assert {"readers.formats.table", "diagnostics.questions.scale"} <= {*ours}
     assert not {*ours} & {
-        "readers.formats.ros_bag", "readers.formats.tum", "readers.formats.numpy_archive",
+        "readers.formats.ros_bag", "readers.formats.tum", "readers.formats.archives",
         "readers.pipeline.relative_motions",
-        "readers.mix_ups.known", "readers.alignment.residuals", "diagnostics.comparison", "diagnostics.maps.map_nees",
-        "diagnostics.monitoring.monitor", "diagnostics.imperfect_truth.uncertain_truth",
+        "readers.mix_ups.known", "readers.alignment", "diagnostics.comparison", "diagnostics.questions.maps",
+        "diagnostics.monitor", "diagnostics.questions.uncertain_truth",
     }  # fmt: skip
 
 

@@ -8,11 +8,24 @@ import pytest
 from scipy import optimize, stats
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups_by_column import Groups
+from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, held_out_by, with_uncertainty
+from consistency.referee.fit_covariance.correct import (
+    are_needed,
+    correct,
+    fit_groups,
+    held_out_by,
+    with_uncertainty,
+)
+from consistency.referee.fit_covariance.estimation import (
+    Score,
+    chance_of_one,
+    floor_interval,
+    interval_of_ratio,
+    maximise,
+)
 from consistency.referee.fit_covariance.factors import (
     FactorBlock,
     Factors,
@@ -25,8 +38,6 @@ from consistency.referee.fit_covariance.factors import (
     run_moments,
     scores,
 )
-from consistency.referee.fit_covariance.intervals import chance_of_one, floor_interval, interval_of_ratio
-from consistency.referee.fit_covariance.likelihood import Score, maximise
 from consistency.referee.types import Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -13,9 +13,8 @@ from command import consistency, refused
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups_by_column import Groups
-from consistency.referee.fit_covariance.correction_files import place_in
-from consistency.referee.fit_covariance.fit_folder import toml
+from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.fit_covariance.fit_files import place_in, toml
 
 RUNS, DRIVES, STEPS = 24, 8, 20
 

@@ -10,9 +10,9 @@ from command import consistency, refused
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
-from consistency.referee.diagnostics.monitoring.gate_ratios import GateRatios
+from consistency.referee.diagnostics.monitor import GateRatios
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.ardupilot_log import read_ratios
+from consistency.referee.readers.formats.flight_logs import read_ratios
 from consistency.referee.verdicts.monitor_sources import read_innovations
 
 pytest.importorskip("pymavlink", reason="needs the extra 'ardupilot'")

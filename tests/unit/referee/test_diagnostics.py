@@ -13,9 +13,8 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
-from consistency.referee.diagnostics.questions import lost_runs
-from consistency.referee.diagnostics.records.large_arrays import FEWER as ROWS
-from consistency.referee.diagnostics.records.valid_covariances import (  # fmt: skip
+from consistency.referee.diagnostics.questions import tails
+from consistency.referee.diagnostics.records.whitening import (
     DEFICIENT,
     EXACT,
     NEGATIVE,
@@ -25,8 +24,9 @@ from consistency.referee.diagnostics.records.valid_covariances import (  # fmt: 
     classify,
     negative,
 )
+from consistency.referee.diagnostics.records.whitening import FEWER as ROWS
 from consistency.referee.diagnostics.statistics import distributions as laws
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import coverage
+from consistency.referee.diagnostics.statistics.nees import coverage
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
 INTERVALS = {
@@ -279,7 +279,7 @@ def test_a_gate_does_not_load_scipy_stats():
 
 def test_ranks_share_the_mean_of_equal_values():
     values = np.random.default_rng(2).integers(0, 9, 40).astype(float)
-    assert_array_equal(lost_runs._ranks(values), stats.rankdata(values))
+    assert_array_equal(tails._ranks(values), stats.rankdata(values))
 
 
 # --- what can be judged as a covariance -----------------------------------------------------------------------

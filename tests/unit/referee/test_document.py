@@ -10,10 +10,11 @@ import pytest
 
 from consistency.diagnostics import Comparison, Interval, MapScore, Record, judge
 from consistency.referee.diagnostics.comparison import Difference
-from consistency.referee.diagnostics.verdict.answers import ABOUT, ALONE
-from consistency.referee.diagnostics.verdict.parts import JointScore, RejectionScore
+from consistency.referee.diagnostics.verdict.parts import ABOUT, ALONE, JointScore, RejectionScore
 from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import (
+    PLAIN,
+    PRINTED,
     Answer,
     Bullets,
     Chapter,
@@ -28,15 +29,28 @@ from consistency.referee.document.blocks import (
     Stack,
     Status,
     Text,
+    fragment,
+    style,
     table,
+    unbroken,
+    written,
 )
-from consistency.referee.document.colours import style
-from consistency.referee.document.compared_filters import comparison_table
-from consistency.referee.document.guard import rejection_cells, rejection_text
-from consistency.referee.document.judged_filters import FURTHER, TERMINAL, cells, document, page, with_values
-from consistency.referee.document.map import MAP_COLUMNS, map_cells, map_lines, map_text
-from consistency.referee.document.needed_runs import plan_lines
-from consistency.referee.document.wording import PLAIN, PRINTED, fragment, unbroken, written
+from consistency.referee.document.tables import (
+    FURTHER,
+    MAP_COLUMNS,
+    TERMINAL,
+    cells,
+    comparison_table,
+    document,
+    map_cells,
+    map_lines,
+    map_text,
+    page,
+    plan_lines,
+    rejection_cells,
+    rejection_text,
+    with_values,
+)
 from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
 
 INF, NAN = float("inf"), float("nan")

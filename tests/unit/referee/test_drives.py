@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.lie_groups import spatial_error
+from consistency.referee.geometry import planar_error, spatial_error
 from consistency.referee.readers.formats.kitti_files import mercator, read_drive
 
 

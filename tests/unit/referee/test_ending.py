@@ -15,9 +15,8 @@ import pytest
 
 from consistency.referee.errors import InputError
 from consistency.referee.system import stopping
-from consistency.referee.system.atomic import write_whole
 from consistency.referee.system.folders import NewFolder, read_manifest, require_free, unfinished_of, write_folder
-from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
+from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent, write_whole
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="fork")
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

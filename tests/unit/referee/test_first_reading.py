@@ -16,10 +16,9 @@ from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
 from consistency.referee.diagnostics.words.sentences import reasons
-from consistency.referee.document.blocks import Quantity
-from consistency.referee.document.judged_filters import TERMINAL, cells, document
-from consistency.referee.document.wording import PLAIN, written
-from consistency.referee.pages.files_report import compose_files
+from consistency.referee.document.blocks import PLAIN, Quantity, written
+from consistency.referee.document.tables import TERMINAL, cells, document
+from consistency.referee.pages.write_pages import compose_files
 from consistency.referee.types import Failure
 
 

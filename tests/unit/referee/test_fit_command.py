@@ -17,11 +17,11 @@ from fit_covariance import drives
 from numpy.testing import assert_allclose, assert_array_less
 
 import consistency as cs
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
+from consistency.referee.diagnostics.verdict.verdict import plain
 from consistency.referee.extras import is_installed
+from consistency.referee.fit_covariance.covariance_ratios import write_motions
 from consistency.referee.fit_covariance.drives import drive_of
-from consistency.referee.fit_covariance.motions import write_motions
-from consistency.referee.fit_covariance.writing import (
+from consistency.referee.fit_covariance.fit_files import (
     ceres,
     gtsam,
     robot_localization,
@@ -30,7 +30,7 @@ from consistency.referee.fit_covariance.writing import (
     straight,
     write_model,
 )
-from consistency.referee.geometry.lie_groups import composed, vectors
+from consistency.referee.geometry import composed, vectors
 from consistency.referee.readers.options import Reading
 
 SPAN = "10m"

@@ -12,8 +12,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import systematic_errors as errors_
-from consistency.referee.fit_covariance.model_text import correction, data_of_model, noise_lines
 from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
+from consistency.referee.fit_covariance.noise_model import correction, data_of_model, noise_lines
 from consistency.referee.fit_covariance.systematic_errors import (
     BACKWARD,
     FORWARD,

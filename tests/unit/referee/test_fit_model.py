@@ -17,14 +17,18 @@ import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.intervals import interval_of
-from consistency.referee.fit_covariance.likelihood import nees_of
-from consistency.referee.fit_covariance.mean_differences import TERMS, PersistentError, variance_between
-from consistency.referee.fit_covariance.model_text import model_sentence, noise_lines
+from consistency.referee.fit_covariance.estimation import interval_of, nees_of
 from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of, vectors_of
 from consistency.referee.fit_covariance.motion_windows import matrices_of as pieces_of
-from consistency.referee.fit_covariance.noise_model import caution
-from consistency.referee.fit_covariance.refusals import RotationGrowth, body_turn, rotation_growth
+from consistency.referee.fit_covariance.noise_model import caution, model_sentence, noise_lines
+from consistency.referee.fit_covariance.refusals import (
+    TERMS,
+    PersistentError,
+    RotationGrowth,
+    body_turn,
+    rotation_growth,
+    variance_between,
+)
 from consistency.referee.fit_covariance.systematic_errors import (
     FORWARD,
     Mean,
@@ -40,7 +44,7 @@ from consistency.referee.fit_covariance.white_noise import (
     jitter_of,
     terms_of,
 )
-from consistency.referee.geometry.lie_groups import composed, inverse, log, vectors
+from consistency.referee.geometry import composed, inverse, log, vectors
 
 GROUPS = ("SE(2)", "SE(3)")
 

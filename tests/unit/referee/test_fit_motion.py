@@ -11,11 +11,9 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.clocks import clock_offset
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
-from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.mean_differences import TERMS, mean_by_motion, p_value_of, values_by_bin
-from consistency.referee.fit_covariance.model_text import correction, model_sentence, noise_lines
+from consistency.referee.fit_covariance.drives import Drive, clock_offset, drive_of
+from consistency.referee.fit_covariance.fit_files import snippets
 from consistency.referee.fit_covariance.motion_windows import (
     ROUNDED,
     angles,
@@ -23,12 +21,11 @@ from consistency.referee.fit_covariance.motion_windows import (
     span_of,
     ways,
 )
-from consistency.referee.fit_covariance.noise_model import decided
-from consistency.referee.fit_covariance.refusals import require_poses
+from consistency.referee.fit_covariance.noise_model import correction, decided, model_sentence, noise_lines
+from consistency.referee.fit_covariance.refusals import TERMS, mean_by_motion, p_value_of, require_poses, values_by_bin
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.white_noise import fit_noise
-from consistency.referee.fit_covariance.writing import snippets
-from consistency.referee.geometry.lie_groups import composed, inverse, vectors
+from consistency.referee.geometry import composed, inverse, vectors
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses, unstated

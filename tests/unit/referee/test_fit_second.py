@@ -9,7 +9,7 @@ import pytest
 from command import consistency
 from numpy.testing import assert_allclose
 
-from consistency.bench.runs.experiment_scripts import sibling
+from consistency.bench.runs.reproduce_findings import sibling
 
 ROOT = Path(__file__).parents[3]
 DATA = Path(os.environ.get("CONSISTENCY_DATA", ROOT.parent / "shared" / "data"))

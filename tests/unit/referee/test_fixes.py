@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_layouts import STEPS, drive, lines, tum
 
 import consistency as cs
-from consistency.referee.readers.formats.geodetic import axes_at, centred, leap_seconds, read_solution
+from consistency.referee.readers.formats.positions import axes_at, centred, leap_seconds, read_solution
 
 START = dt.datetime(2024, 3, 5, 10, 0, 0)  # of GPS, 18 s ahead of UTC
 EPOCH = 1709632800.0 - 18.0

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.diagnostics import judge
-from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.geometry import SPATIAL
 
 # standard deviations of x, y, z (m) and of the rotation about x, y, z (rad): they differ, so that a frame shows
 SIGMA = np.array([0.02, 0.2, 0.06, 0.01, 0.1, 0.03])

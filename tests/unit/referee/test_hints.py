@@ -12,11 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics import Record
 from consistency.referee.errors import InputError
-from consistency.referee.geometry import wrap
-from consistency.referee.geometry.conventions import planar_error
-from consistency.referee.geometry.lie_groups import composed, matrices, spatial_error, vectors
+from consistency.referee.geometry import composed, matrices, planar_error, spatial_error, vectors, wrap
 from consistency.referee.notebook.read_and_judge import judge, read
-from consistency.referee.readers.alignment.world_frames import (
+from consistency.referee.readers.alignment import (
     BodyTransform,
     WorldTransform,
     carried,
@@ -27,14 +25,12 @@ from consistency.referee.readers.alignment.world_frames import (
 )
 from consistency.referee.readers.mix_ups import hints as readers_hints
 from consistency.referee.readers.mix_ups.hints import hints, turns
-from consistency.referee.readers.mix_ups.known import Guess
-from consistency.referee.readers.mix_ups.known_worlds import _ned
+from consistency.referee.readers.mix_ups.known import Guess, _ned
 from consistency.referee.readers.mix_ups.reading_fit import COST, FACTOR, PIECES, SMALL, fit_of, thinned
 from consistency.referee.readers.pipeline.relative_motions import causes_of_motions
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.runs_to_record import Track, _singular, symmetric
+from consistency.referee.readers.runs_to_record import Relative, Track, _singular, symmetric
 from consistency.referee.readers.truth_matching import Poses
-from consistency.referee.readers.windows import Relative
 from consistency.testing import assert_consistent
 
 RUNS, STEPS = 3, 60

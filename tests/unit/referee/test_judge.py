@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy import stats
 
-from consistency.bench.runs.scores_by_run import mean_nees_of_runs, wins
+from consistency.bench.runs.results_to_records import mean_nees_of_runs, wins
 from consistency.diagnostics import Record
 from consistency.referee.types import Failure
 

@@ -15,10 +15,10 @@ from numpy.testing import assert_allclose
 from recorded import read_recordings
 
 import consistency as cs
-from consistency.referee.readers.clock_units import unit_apart
-from consistency.referee.readers.formats.file_head import fields_of
+from consistency.referee.readers.clocks import unit_apart
+from consistency.referee.readers.formats.columns import require_units
+from consistency.referee.readers.formats.file_kinds import fields_of
 from consistency.referee.readers.formats.sheet import TableRows
-from consistency.referee.readers.formats.spellings import require_units
 from consistency.referee.types import Array
 
 DATA = Path(os.environ.get("CONSISTENCY_DATA", Path(__file__).parents[4] / "shared" / "data"))

@@ -20,11 +20,11 @@ from consistency.diagnostics import (
     lost_runs,
     pilot_plan,
 )
-from consistency.referee.diagnostics.questions.lost_runs import lost_evidence, lost_of
+from consistency.referee.diagnostics.questions.tails import lost_evidence, lost_of
 from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
-from consistency.referee.gating.gate_terms import RunningTest, watching
+from consistency.referee.gating.session import RunningTest, watching
 from consistency.referee.types import Failure
-from consistency.referee.verdicts.planned_runs import plan
+from consistency.referee.verdicts.judge_sources import plan
 from consistency.testing import InsufficientTrials, assert_consistent
 
 SURE = 1e-5

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.diagnostics import Record, Settings, judge
-from consistency.referee.diagnostics.questions.innovations import outliers_of
-from consistency.referee.gating.checked_arrays import record_of_checked
-from consistency.referee.readers.formats.position_truth import placeholder
-from consistency.referee.readers.heading_units import require_radians
+from consistency.referee.diagnostics.questions.whiteness import outliers_of
+from consistency.referee.gating.checked_input import record_of_checked
+from consistency.referee.readers.axes_and_units import require_radians
+from consistency.referee.readers.formats.positions import placeholder
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import not_estimated
 from consistency.referee.readers.truth_matching import AXES, REST, Poses

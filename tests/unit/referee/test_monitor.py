@@ -12,8 +12,16 @@ from documents import blocks
 from scipy import special, stats
 
 import consistency as cs
-from consistency.referee.diagnostics.monitoring.monitor import RATIOS, alternatives, bet_on, start_share
-from consistency.referee.diagnostics.monitoring.truncated_chi2 import gate_limit, gated_mean, gated_scale, log_chi2_cdf
+from consistency.referee.diagnostics.monitor import (
+    RATIOS,
+    alternatives,
+    bet_on,
+    gate_limit,
+    gated_mean,
+    gated_scale,
+    log_chi2_cdf,
+    start_share,
+)
 from consistency.referee.verdicts.monitor_sources import read_innovations, watch
 
 

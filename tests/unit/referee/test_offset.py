@@ -11,8 +11,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.geometry import wrap
-from consistency.referee.readers import clock_offset
-from consistency.referee.readers.clock_offset import (
+from consistency.referee.readers import clocks
+from consistency.referee.readers.clocks import (
     Offset,
     Sample,
     clock_shift,
@@ -105,7 +105,7 @@ def test_a_step_goes_to_the_offset(rng):
 def test_the_interval_by_hand(rng, monkeypatch):
     """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
     steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
-    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array([next(steps)]))
+    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.array([next(steps)]))
     found = offset_of(samples_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)]))
     reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
     assert found.high - found.value == pytest.approx(reach, rel=1e-6)
@@ -128,7 +128,7 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alo
 
     slope = (nees - then) / 0.04**2
     monkeypatch.setattr(Sample, "squares", sizes(lambda shift: then + slope * (shift - 0.04) ** 2))
-    monkeypatch.setattr(clock_offset, "steps_of", steps)
+    monkeypatch.setattr(clocks, "steps_of", steps)
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert asked == [12]
     assert found.alone is alone
@@ -143,14 +143,14 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alo
 @pytest.mark.parametrize("steps, p", [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
 def test_steps_that_agree_are_certain_and_two_are_none(steps, p, rng, monkeypatch):
     monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + (shift - 0.04) ** 2))
-    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.array(steps))
+    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.array(steps))
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (None if found is None else found.p_value) == p
 
 
 def test_steps_that_agree_on_no_offset_find_none(rng, monkeypatch):
     monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + abs(shift)))
-    monkeypatch.setattr(clock_offset, "steps_of", lambda *_: np.zeros(4))
+    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.zeros(4))
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (found.value, found.p_value) == (0.0, 1.0)
 
@@ -204,7 +204,7 @@ def test_estimates_show_an_offset_of_its_own_sign(rng):
 
 def test_the_error_of_a_row_is_not_in_the_motion_that_it_is_compared_with(rng, monkeypatch):
     """Errors of single fixes go with the motion of the estimates to their own row, by 40 standard errors."""
-    monkeypatch.setattr(clock_offset, "SHOWN", 1e-7)
+    monkeypatch.setattr(clocks, "SHOWN", 1e-7)
     runs = [run_of(rng, 0.0) for _ in range(30)]
     assert not shows_in_estimates(samples_of(runs), 0.01)
     assert not shows_in_estimates(samples_of(runs), -0.01)
@@ -216,9 +216,9 @@ def test_what_estimates_show_by_hand(rng, monkeypatch):
     The standard error is then the root of 2 / 3 * (0.05^2 + 0.05^2), 1 / (10 sqrt 3).
     That is t = -6.93, with the probability 0.0101 with 2 degrees of freedom.
     """
-    monkeypatch.setattr(clock_offset, "_estimate_sums", lambda top, parts: np.array([[top, 10.0]]))
+    monkeypatch.setattr(clocks, "_estimate_sums", lambda top, parts: np.array([[top, 10.0]]))
     for rate, shown in ((0.0102, True), (0.0100, False)):
-        monkeypatch.setattr(clock_offset, "SHOWN", rate)
+        monkeypatch.setattr(clocks, "SHOWN", rate)
         assert shows_in_estimates([3.0, 5.0, 4.0], -0.4) is shown
         assert not shows_in_estimates([3.0, 5.0, 4.0], 0.4)
 
@@ -282,7 +282,7 @@ def test_of_many_runs_some_are_looked_at(rng):
     runs = [replace(run_of(rng, 0.04), run=number) for number in range(3)]
     many = [replace(runs[k % 3], run=k) for k in range(200)]
     numbers = [sample.poses.run for sample in samples_of(many)]
-    assert len(numbers) == clock_offset.RUNS == 60
+    assert len(numbers) == clocks.RUNS == 60
     assert numbers == sorted(set(numbers))
     assert (numbers[0], numbers[-1]) == (0, 199)
     assert len(samples_of(many[:60])) == 60

@@ -10,11 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 import consistency as cs
 from consistency.diagnostics import Design, MapRecord, Record, Rejections, Settings, Verdict, follow, judge, look
 from consistency.referee.diagnostics.judging.error_parts import _sum_of_correlations
-from consistency.referee.diagnostics.maps.map_nees import last_nees
+from consistency.referee.diagnostics.questions.maps import last_nees
 from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records.large_arrays import every_entry
-from consistency.referee.diagnostics.records.whitening import whiten, whiten_group
-from consistency.referee.diagnostics.verdict.answers import (
+from consistency.referee.diagnostics.records.whitening import every_entry, whiten, whiten_group
+from consistency.referee.diagnostics.verdict.parts import (
     MAIN,
     STEP,
     answers,

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.readers.formats.file_head import head_of
+from consistency.referee.readers.formats.columns import renamed
+from consistency.referee.readers.formats.file_kinds import head_of
 from consistency.referee.readers.formats.sheet import sheet_of
-from consistency.referee.readers.formats.spellings import renamed
 from consistency.referee.readers.places import one_of_each_kind
 
 STEPS = 6

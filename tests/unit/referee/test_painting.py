@@ -9,13 +9,11 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_array_equal
 from painted import legend_of, places, shaded
 
-from consistency.referee.document.blocks import Document, Figure
-from consistency.referee.document.colours import EXPECTED, LIMIT, Look, style
+from consistency.referee.document.blocks import EXPECTED, LIMIT, Document, Figure, Look, style
 from consistency.referee.show import as_html
-from consistency.referee.show.matplotlib_style import (
-    LIMIT as MOST,
-)
-from consistency.referee.show.matplotlib_style import (
+from consistency.referee.show.figures import LIMIT as MOST
+from consistency.referee.show.figures import (
+    MOST_TITLES,
     NARROWEST,
     TITLE,
     add_legend,
@@ -24,18 +22,22 @@ from consistency.referee.show.matplotlib_style import (
     curve,
     dodge,
     dots,
+    drawn,
     edges,
     intervals,
     log_axis,
     make_map,
     name_rows,
+    paint,
     panel_legend,
     path,
+    png,
     points,
     rows_of,
+    saved,
+    svg,
     thin,
 )
-from consistency.referee.show.svg import MOST_TITLES, drawn, paint, png, saved, svg
 
 ODD = ("$x^2$ and \\frac", "_hidden", "<script>", "#*@", "$$y$$")
 STEPS = np.arange(1.0, 6.0)

@@ -13,10 +13,9 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Record, Settings, gate_runs, judge, ratio_interval
-from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import each_alone
-from consistency.referee.gating.gate_terms import RunningTest, watching
-from consistency.referee.gating.session_ledger import needed_at
+from consistency.referee.diagnostics.records.whitening import diagonal
+from consistency.referee.gating.session import RunningTest, needed_at, watching
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 SURE = 1e-6

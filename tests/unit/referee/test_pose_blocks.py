@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.pose_covariances import BLOCKS, covariances_in
-from consistency.referee.readers.formats.rotations import are_rotations, not_unit, quaternions
+from consistency.referee.readers.formats.pose_rows import BLOCKS, are_rotations, covariances_in, not_unit, quaternions
 from consistency.referee.readers.formats.text_blocks import Lines, read_rows
 
 

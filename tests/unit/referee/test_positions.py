@@ -27,8 +27,8 @@ from test_layouts import (
 )
 
 import consistency as cs
-from consistency.referee.readers.formats.planar_columns import motions_of, poses_of
-from consistency.referee.readers.formats.position_truth import _jacobian
+from consistency.referee.readers.formats.pose_rows import motions_of, poses_of
+from consistency.referee.readers.formats.positions import _jacobian
 from consistency.referee.readers.formats.table import planar_sheet
 
 ARM = np.array([0.3, -0.2, 0.5])

@@ -17,8 +17,7 @@ from programs import COPY, STEPS, script, write_tables
 import consistency as cs
 from consistency.commands import main
 from consistency.referee.errors import InputError
-from consistency.referee.programs.process import Processes, run_program
-from consistency.referee.programs.words import LARGEST_SEED, program_of, seed_of
+from consistency.referee.programs.process import LARGEST_SEED, Processes, program_of, run_program, seed_of
 from consistency.referee.readers.pipeline.program_runs import filled
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_program_consistent
 

@@ -16,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.diagnostics import gate_runs
-from consistency.referee.gating.gate_terms import FIRST, final_rate, in_place_rate
-from consistency.referee.gating.session_ledger import path_fault
+from consistency.referee.gating.session import FIRST, final_rate, in_place_rate, path_fault
 
 SAMPLES = '''
 import numpy as np

@@ -22,8 +22,7 @@ import consistency as cs
 from consistency.diagnostics import Settings
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import planar_error, se2_log
-from consistency.referee.geometry.lie_groups import se3_log, spatial_error
+from consistency.referee.geometry import planar_error, se2_log, se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times
 from consistency.referee.verdicts.judge_sources import judge_all
 

@@ -15,13 +15,12 @@ from numpy.testing import assert_allclose
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics.questions.independence import ENOUGH
-from consistency.referee.diagnostics.verdict.as_dictionary import plain
-from consistency.referee.geometry.lie_groups import composed, matrices, propagated, to_left
+from consistency.referee.diagnostics.questions.whiteness import ENOUGH
+from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.geometry import composed, matrices, propagated, to_left
 from consistency.referee.readers.pipeline.relative_motions import windows_of
-from consistency.referee.readers.windows import Relative
-from consistency.referee.verdicts.baselines import baseline
-from consistency.referee.verdicts.compare_sources import compare_with
+from consistency.referee.readers.runs_to_record import Relative
+from consistency.referee.verdicts.compare_sources import baseline, compare_with
 from consistency.referee.verdicts.judge_sources import judge_all
 
 GROUPS = tuple(world.SIGMA)

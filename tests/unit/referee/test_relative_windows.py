@@ -9,10 +9,20 @@ from numpy.testing import assert_allclose, assert_array_equal
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.geometry.conventions import PLANAR, SPATIAL, planar_error
-from consistency.referee.geometry.lie_groups import adjoint, composed, inverse, log, matrices, spatial_error, to_left
+from consistency.referee.geometry import (
+    PLANAR,
+    SPATIAL,
+    adjoint,
+    composed,
+    inverse,
+    log,
+    matrices,
+    planar_error,
+    spatial_error,
+    to_left,
+)
 from consistency.referee.readers.pipeline.relative_motions import windows_of
-from consistency.referee.readers.windows import Relative, relative_of, windows
+from consistency.referee.readers.runs_to_record import Relative, relative_of, windows
 from consistency.referee.verdicts.judge_sources import judge_all
 
 GROUPS = tuple(world.SIGMA)

@@ -15,10 +15,9 @@ from scipy import stats
 
 import consistency as cs
 from consistency.referee.document.blocks import Details, Figure, Table, Text
-from consistency.referee.pages.files_report import compose_files
-from consistency.referee.pages.judged_estimators import time_axis_of
-from consistency.referee.pages.record_figures import observed_coverage, record_figures, unit_of
-from consistency.referee.pages.trajectory import shown_run
+from consistency.referee.pages.record_figures import observed_coverage, record_figures, shown_run, unit_of
+from consistency.referee.pages.verdicts import time_axis_of
+from consistency.referee.pages.write_pages import compose_files
 from consistency.referee.show import as_html
 from consistency.referee.verdicts.judge_sources import judge_all
 

@@ -26,12 +26,14 @@ from consistency.diagnostics import (
     ratio_interval,
     required_runs,
 )
-from consistency.referee.diagnostics.questions.equivalence import (
+from consistency.referee.diagnostics.questions.scale import (
+    acceptance,
     equivalence,
     equivalence_by_betting,
     equivalence_of_total,
+    run_means,
+    scale_test,
 )
-from consistency.referee.diagnostics.questions.scale import acceptance, run_means, scale_test
 
 SURE = 1e-5
 

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.words.faults import bias_text, scale_text, 
 from consistency.referee.diagnostics.words.numbers import ratio_text, short
 from consistency.referee.diagnostics.words.sentences import reasons
 from consistency.referee.document.blocks import Quantity
-from consistency.referee.document.judged_filters import TERMINAL, document, rows
+from consistency.referee.document.tables import TERMINAL, document, rows
 from consistency.referee.show.terminal import show
 
 SURE = 1e-5

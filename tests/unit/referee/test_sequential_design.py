@@ -14,7 +14,7 @@ from scipy import integrate, stats
 from consistency.diagnostics import Design, Record, Verdict, e_process, ever, follow, judge, look, sequential_design
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
-from consistency.referee.diagnostics.questions.equivalence import equivalence, equivalence_by_betting
+from consistency.referee.diagnostics.questions.scale import equivalence, equivalence_by_betting
 from consistency.referee.diagnostics.statistics import nees as betting
 from consistency.referee.types import Failure
 

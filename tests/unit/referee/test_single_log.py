@@ -15,7 +15,7 @@ from single_log import errors
 
 import consistency as cs
 from consistency.diagnostics import Record, Settings, judge
-from consistency.referee.diagnostics.planning.single_log import (
+from consistency.referee.diagnostics.questions.planning import (
     APART,
     MOST,
     correlation_time,
@@ -23,7 +23,8 @@ from consistency.referee.diagnostics.planning.single_log import (
     memory_of,
     within,
 )
-from consistency.referee.diagnostics.questions.independence import (
+from consistency.referee.diagnostics.questions.tails import early_ends
+from consistency.referee.diagnostics.questions.whiteness import (
     ALIKE,
     ENOUGH,
     FEWEST_PIECES,
@@ -31,9 +32,8 @@ from consistency.referee.diagnostics.questions.independence import (
     SIZES,
     independence,
 )
-from consistency.referee.diagnostics.questions.lost_runs import early_ends
-from consistency.referee.diagnostics.verdict.answers import BIAS
-from consistency.referee.geometry.conventions import SPATIAL
+from consistency.referee.diagnostics.verdict.parts import BIAS
+from consistency.referee.geometry import SPATIAL
 from consistency.referee.verdicts.judge_sources import judge_all
 
 SETTINGS = Settings()

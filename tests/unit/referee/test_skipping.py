@@ -12,11 +12,11 @@ from recorded import read_recordings
 import consistency as cs
 from consistency.diagnostics import Record, Settings
 from consistency.referee.diagnostics.judging.fault_location import until
-from consistency.referee.diagnostics.questions.anees_band import simultaneous_band
 from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped, skip_of, without_first
+from consistency.referee.diagnostics.questions.scale import simultaneous_band
+from consistency.referee.diagnostics.records.record import Skip, Skipped, skip_of, without_first
 from consistency.referee.errors import InputError
-from consistency.referee.verdicts.baselines import baseline, read_baseline, write_baseline
+from consistency.referee.verdicts.compare_sources import baseline, read_baseline, write_baseline
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse
 
 RUNS, STEPS, FIRST = 30, 40, 6

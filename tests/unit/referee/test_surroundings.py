@@ -18,14 +18,14 @@ from consistency.commands import main
 from consistency.referee.document.blocks import Document
 from consistency.referee.parsing import require_name
 from consistency.referee.programs import process
-from consistency.referee.programs.words import program_of
+from consistency.referee.programs.process import program_of
 from consistency.referee.readers.formats import file_kinds
 from consistency.referee.readers.formats.sheet import read_sheet, require_distinct
 from consistency.referee.readers.formats.text_blocks import Block, floats, read_numbers
 from consistency.referee.readers.mix_ups.reading_fit import fit_of
 from consistency.referee.readers.truth_matching import Poses
-from consistency.referee.show import as_md, svg
-from consistency.referee.show.matplotlib_style import canvas
+from consistency.referee.show import as_md, figures
+from consistency.referee.show.figures import canvas
 from consistency.referee.system import stopping
 from consistency.referee.system.folders import NewFolder, require_free
 
@@ -90,15 +90,15 @@ def test_figures_have_our_style_whatever_the_user_has_set(monkeypatch):
         axes.set_title("a $title$")
         return figure
 
-    plain = svg.svg(draw)
+    plain = figures.svg(draw)
     with mpl.rc_context({"text.usetex": True, "font.size": 40.0, "savefig.bbox": "tight", "lines.linewidth": 9.0}):
-        assert svg.svg(draw) == plain
-        assert svg.drawn(draw).axes[0].title.get_fontsize() == svg.drawn(draw).axes[0].title.get_size() < 10
+        assert figures.svg(draw) == plain
+        assert figures.drawn(draw).axes[0].title.get_fontsize() == figures.drawn(draw).axes[0].title.get_size() < 10
         assert mpl.rcParams["text.usetex"]
 
 
 def test_a_backend_that_is_not_there_is_not_asked_for(files):
-    code = "from consistency.referee.show.matplotlib_style import own_style\nwith own_style():\n    print('drawn')"
+    code = "from consistency.referee.show.figures import own_style\nwith own_style():\n    print('drawn')"
     (files / "matplotlibrc").write_text("axes.prop_cycle: bad(\nno.such.key: 3\n")
     env = {**os.environ, "MPLBACKEND": "nonsense", "MATPLOTLIBRC": str(files)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
@@ -112,7 +112,7 @@ def test_the_verdict_is_said_before_anything_is_drawn(files, capsys, monkeypatch
         said.append(capsys.readouterr().out)
         raise cs.InputError("no picture")
 
-    monkeypatch.setattr(svg, "paint", paint)
+    monkeypatch.setattr(figures, "paint", paint)
     assert analyse("est.csv", "--report", "report") == 2
     assert "undecided" in said[0]
     assert not Path("report").exists()

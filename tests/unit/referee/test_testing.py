@@ -16,7 +16,7 @@ from draws import autoregression, identities
 
 import consistency as cs
 from consistency.diagnostics import gate_runs
-from consistency.referee.gating.checked_arrays import planned_dof, record_of_checked
+from consistency.referee.gating.checked_input import planned_dof, record_of_checked
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 RARE = 1e-6  # false-alarm rate of a gate here

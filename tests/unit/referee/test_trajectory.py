@@ -9,9 +9,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Record
-from consistency.referee.pages.record_figures import overview, record_figures, unit_of
-from consistency.referee.pages.trajectory import MOST, ellipse, trajectory_panel
-from consistency.referee.show.svg import drawn
+from consistency.referee.pages.record_figures import MOST, ellipse, overview, record_figures, trajectory_panel, unit_of
+from consistency.referee.show.figures import drawn
 
 STEPS = 60
 

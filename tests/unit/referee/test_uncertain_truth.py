@@ -14,7 +14,7 @@ from recorded import read_recordings
 
 import consistency as cs
 from consistency.diagnostics import Record, Settings, judge
-from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import (
+from consistency.referee.diagnostics.questions.uncertain_truth import (
     contrasts,
     of_both,
     uncertain_truth,

@@ -15,10 +15,10 @@ from scipy import stats
 
 from consistency.diagnostics import Record, Settings, judge
 from consistency.referee.diagnostics.judging import error_parts
-from consistency.referee.diagnostics.questions.shape import pair_p_values
+from consistency.referee.diagnostics.questions.bias_and_shape import pair_p_values
 from consistency.referee.diagnostics.verdict.parts import ComponentRatios, Interval
+from consistency.referee.diagnostics.words.faults import factors_text, unlike_text
 from consistency.referee.diagnostics.words.sentences import reasons
-from consistency.referee.diagnostics.words.unlike_factors import factors_text, unlike_text
 
 SURE = 1e-5
 INERTIAL = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")

@@ -13,18 +13,18 @@ from scipy import stats
 import consistency as cs
 from consistency.diagnostics import Answer, Equivalence, Interval, Record, Settings, Verdict, anees_interval
 from consistency.diagnostics import judge as judge_evidence
-from consistency.referee.diagnostics.records.skipped_start import Skip, Skipped
+from consistency.referee.diagnostics.records.record import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
-from consistency.referee.diagnostics.verdict.answers import (
+from consistency.referee.diagnostics.verdict.parts import (
     ABOUT,
     GROUP,
     JOINT,
     JOINT_DISTRIBUTION,
     MAIN,
     SHARES,
+    Innovations,
     answers,
 )
-from consistency.referee.diagnostics.verdict.parts import Innovations
 from consistency.referee.types import Array, Failure
 
 RUNS, STEPS = 50, 40

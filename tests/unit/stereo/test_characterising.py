@@ -12,17 +12,34 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
-from consistency.bench.scenario.effects.node_tables import BiasMap, bilinear, hats
+from consistency.bench.scenario.observations import BiasMap, bilinear, hats
 from consistency.bench.simulation import simulate
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising import coordinate_fit
-from consistency.stereo.characterising.bias_map import estimate_bias, grid_of, shrunken
-from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.coordinate_fit import Levels, Mixture, moving_over_rest, rate, tails
-from consistency.stereo.characterising.likelihood import Likelihood, Parameters, Rows, fit, regress
+from consistency.stereo.characterising.characterise import (
+    Residuals,
+    characterise,
+    estimate_bias,
+    grid_of,
+    octaves,
+    residuals_of,
+    select,
+    shrunken,
+)
+from consistency.stereo.characterising.coordinate_fit import (
+    Levels,
+    Likelihood,
+    Mixture,
+    Parameters,
+    Rows,
+    fit,
+    moving_over_rest,
+    rate,
+    regress,
+    tails,
+)
 from consistency.stereo.characterising.sensor_text import sentences
-from consistency.stereo.characterising.truth_residuals import Residuals, octaves, residuals_of, select
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))

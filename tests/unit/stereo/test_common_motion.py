@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
-from consistency.bench.models import planar, point, stereo
+from consistency.bench.models import observation
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
-from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.pages.write_pages import facts
 from consistency.stereo.visual_odometry import common_motion
 from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
 
@@ -30,11 +30,11 @@ SENSORS = {
 
 def seen_by(sensor, pose, places):
     """What a sensor of a robot at ``pose`` measures of points (n, 3), without noise."""
-    x, y, z = point.to_sensor(*point.to_robot(*pose, *places.T), sensor.mount.packed())
+    x, y, z = observation.to_sensor(*observation.to_robot(*pose, *places.T), sensor.mount.packed())
     if sensor.model == "uvd":
-        return np.column_stack(stereo.project(x, y, z, sensor.f, sensor.B))
+        return np.column_stack(observation.project(x, y, z, sensor.f, sensor.B))
     if sensor.model == "range-bearing":
-        return np.column_stack(planar.range_bearing(x, y))
+        return np.column_stack(observation.range_bearing(x, y))
     return np.column_stack([x, y, z])[:, : sensor.size]
 
 

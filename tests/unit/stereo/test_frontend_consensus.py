@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import consistency as cs
-from consistency.stereo.visual_odometry.cameras.input_errors import MatchError
+from consistency.stereo.visual_odometry.arrays import MatchError
 from consistency.stereo.visual_odometry.odometry import bridged
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, estimate_motion
 from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.geometry import rotation
 from consistency.stereo.frontend.camera_truth import read_truth
-from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration, read_kitti
-from consistency.stereo.visual_odometry.cameras.camera_pair import rectify
+from consistency.stereo.visual_odometry.calibration_files import read_calibration, read_kitti
+from consistency.stereo.visual_odometry.rig import rectify
 from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.bench.store.recorded_log import read_log
-from consistency.referee.geometry.lie_groups import spatial_error
+from consistency.referee.geometry import spatial_error
 from consistency.referee.system.folders import read_manifest
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.camera_truth import read_truth
-from consistency.stereo.frontend.images_to_log import motions_text
-from consistency.stereo.frontend.planar_log import (
+from consistency.stereo.frontend.images_to_log import (
     CAMERA,
     in_robot_axes,
+    motions_text,
     planar_motions,
     planar_path,
     relative,

@@ -19,10 +19,10 @@ from consistency.referee.geometry import rotation
 from consistency.referee.readers.formats.kitti_files import drive_poses
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.camera_truth import find_truth, missing_of_drive, read_truth
-from consistency.stereo.frontend.planar_log import plane_of
-from consistency.stereo.visual_odometry.cameras.calibration_files import read_calibration
-from consistency.stereo.visual_odometry.cameras.camera_pair import rectify
+from consistency.stereo.frontend.images_to_log import plane_of
+from consistency.stereo.visual_odometry.calibration_files import read_calibration
 from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
+from consistency.stereo.visual_odometry.rig import rectify
 from consistency.stereo.visual_odometry.sequence import read_sequence
 from consistency.vision import RelativePose
 

@@ -6,17 +6,21 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
-from consistency.stereo.rendered_images.camera import StereoCamera
-from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Chain, Tracks
-from consistency.stereo.rendered_images.sensor_tables import (
+from consistency.stereo.rendered_images.chain import (
+    MISMATCH,
+    POINT,
     Biases,
+    Chain,
     Growth,
+    Stops,
+    Tracks,
     bias_map,
     disparity_growth,
+    stand,
     track_means,
 )
+from consistency.stereo.rendered_images.scene import StereoCamera
 from consistency.stereo.rendered_images.stages import Spread
-from consistency.stereo.rendered_images.stops import Stops, stand
 
 NODES = np.array([2.25, 6.0, 10.0, 13.5])
 U, V = np.array([-90.0, 0.0, 90.0]), np.array([-90.0, 0.0, 90.0])

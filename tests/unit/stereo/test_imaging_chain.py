@@ -7,7 +7,6 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.stereo.rendered_images import chain as module
-from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
 from consistency.stereo.rendered_images.chain import (
     DRIFTED,
     JUNCTION,
@@ -17,13 +16,25 @@ from consistency.stereo.rendered_images.chain import (
     POINT,
     REJECTED,
     Chain,
+    Stops,
     Tracks,
     at_junction,
     join_tracks,
+    pose_at,
     stage,
+    stand,
+    wall_texture,
 )
-from consistency.stereo.rendered_images.render import film
-from consistency.stereo.rendered_images.scene import Layer, Plain, RandomTexture, Scene
+from consistency.stereo.rendered_images.scene import (
+    Camera,
+    Layer,
+    Lens,
+    Plain,
+    RandomTexture,
+    Scene,
+    StereoCamera,
+    film,
+)
 from consistency.stereo.rendered_images.stages import (
     BlockMatching,
     GoodFeatures,
@@ -39,7 +50,6 @@ from consistency.stereo.rendered_images.stages import (
     dissimilarity,
     patches,
 )
-from consistency.stereo.rendered_images.stops import Stops, pose_at, stand, wall_texture
 
 pytest.importorskip("cv2")
 

@@ -11,9 +11,8 @@ import consistency as cs
 from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections.published_findings import exhibit_blocks
 from consistency.referee.document.blocks import Heading, Table
-from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Tracks
+from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Stops, Tracks, wall_texture
 from consistency.stereo.rendered_images.scene import Layer, Scene
-from consistency.stereo.rendered_images.stops import Stops, wall_texture
 
 pytest.importorskip("cv2")
 images = figures("images")

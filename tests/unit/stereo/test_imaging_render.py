@@ -6,9 +6,21 @@ from numpy.testing import assert_allclose
 
 import consistency as cs
 from consistency.referee.geometry import rotation
-from consistency.stereo.rendered_images.camera import Camera, Lens, StereoCamera
-from consistency.stereo.rendered_images.render import digitised, film, render, render_pair
-from consistency.stereo.rendered_images.scene import Blobs, Layer, Plain, RandomTexture, Scene, to_camera
+from consistency.stereo.rendered_images.scene import (
+    Blobs,
+    Camera,
+    Layer,
+    Lens,
+    Plain,
+    RandomTexture,
+    Scene,
+    StereoCamera,
+    digitised,
+    film,
+    render,
+    render_pair,
+    to_camera,
+)
 
 WRONG = StereoCamera(Camera(lens=Lens(0.01)), Camera(lens=Lens(-0.01, 0.002), turned=(0.004, -0.003, 0.002)))
 POSE = np.array([0.1, 0.05, -0.02, 0.01, 0.02, -0.03])

@@ -8,8 +8,7 @@ from scripts import experiment
 
 import consistency as cs
 from consistency.bench.scenario import PicturedSensor
-from consistency.stereo.characterising.characterise import characterise
-from consistency.stereo.characterising.truth_residuals import Residuals
+from consistency.stereo.characterising.characterise import Residuals, characterise
 
 SIGMA = (0.2, 0.15, 0.3)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from consistency.stereo.visual_odometry.cameras import arrays
+from consistency.stereo.visual_odometry import arrays
 
 
 @pytest.mark.parametrize("m", [2, 3, 6])

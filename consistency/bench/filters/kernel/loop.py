@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters.compiler.by_reference import by_reference, keep
+from consistency.bench.filters.compiler.dispatch import by_reference, keep
 from consistency.bench.filters.compiler.jit import Kernel, inner
-from consistency.bench.filters.kernel.arrays import (
+from consistency.bench.filters.kernel.linalg import (
     copy,
     copy_matrix,
+    definiteness_with,
     fill,
     fill_matrix,
     filled,
@@ -20,8 +21,6 @@ from consistency.bench.filters.kernel.arrays import (
     matrix,
     sum_of,
 )
-from consistency.bench.filters.kernel.covariance import begin_landmark
-from consistency.bench.filters.kernel.linalg import definiteness_with
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
@@ -40,14 +39,14 @@ from consistency.bench.filters.kernel.part_functions import (
     predict,
     prepare,
     rejected_rows,
+    robot_frame,
     screen,
     settle,
     spare_width,
     to_error,
     world_point,
 )
-from consistency.bench.filters.kernel.unicycle import robot_frame
-from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Work, make_work
+from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Work, begin_landmark, make_work
 from consistency.referee.types import Array, Indices
 
 

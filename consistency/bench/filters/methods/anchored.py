@@ -13,6 +13,7 @@ from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.part_functions import (
+    Frame,
     Triple,
     insert,
     landmark_width,
@@ -20,10 +21,9 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
-from consistency.bench.filters.kernel.unicycle import Frame
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
-from consistency.bench.models.point import Mounting, turned_to_robot
+from consistency.bench.models.observation import Mounting, turned_to_robot
 from consistency.referee.types import Array
 
 

@@ -14,13 +14,13 @@ from consistency.bench.filters.kernel.part_functions import (
     Factors,
     Slam,
     State,
+    Unicycle,
     correct,
     landmark_width,
     place,
     predict_innovation,
     stands_apart,
 )
-from consistency.bench.filters.kernel.unicycle import Unicycle
 from consistency.bench.filters.kernel.update_steps import (
     Work,
     add_noise,

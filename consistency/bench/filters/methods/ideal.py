@@ -17,8 +17,8 @@ from consistency.bench.filters.kernel.part_functions import (
     observation_point,
     place,
     propagate_covariance_at,
+    propagate_covariance_by,
 )
-from consistency.bench.filters.kernel.unicycle import propagate_covariance_by
 from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import invert_at, landmark_at_known, motion_at_known, observation_at_known

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.covariance import state_index
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -19,7 +18,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict,
     predict_innovation,
 )
-from consistency.bench.filters.kernel.update_steps import Work, correct_iterated, innovate
+from consistency.bench.filters.kernel.update_steps import Work, correct_iterated, innovate, state_index
 from consistency.bench.filters.methods import ukf
 from consistency.bench.filters.methods.ukf import SigmaRoom, Unscented, innovate_by_points
 from consistency.bench.filters.textbook.ispkf import PASSES, IteratedPointsKalman

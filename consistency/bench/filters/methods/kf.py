@@ -12,7 +12,7 @@ import numpy as np
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy_matrix, matrix, vector
+from consistency.bench.filters.kernel.linalg import copy_matrix, matrix, vector
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
@@ -23,9 +23,10 @@ from consistency.bench.filters.kernel.part_functions import (
     observation_point,
     observed_width,
     place,
+    propagate_covariance,
     propagate_covariance_at,
+    robot_frame,
 )
-from consistency.bench.filters.kernel.unicycle import propagate_covariance, robot_frame
 from consistency.bench.filters.kernel.update_steps import Work, linearise_at
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook import basics

@@ -34,17 +34,18 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.arrays import filled, integers, matrix, vector
+from consistency.bench.filters.kernel.linalg import filled, integers, matrix, vector
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     landmark_point,
     landmark_width,
     make_notes,
+    move,
     place,
     propagate_covariance_at,
+    propagate_covariance_by,
 )
-from consistency.bench.filters.kernel.unicycle import move, propagate_covariance_by
 from consistency.bench.filters.kernel.update_steps import Work, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.oc import ConstrainedKalman

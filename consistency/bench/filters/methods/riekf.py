@@ -7,21 +7,20 @@ from typing import NamedTuple
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import fill
-from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.kernel.covariance import add_gram_to_state
+from consistency.bench.filters.kernel.linalg import add_transposed_times, fill
 from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     insert_error,
     landmark_width,
+    move,
+    noise_columns,
     pose_covariance,
     propagate,
     retract,
     to_error,
 )
-from consistency.bench.filters.kernel.unicycle import move, noise_columns
-from consistency.bench.filters.kernel.update_steps import Work
+from consistency.bench.filters.kernel.update_steps import Work, add_gram_to_state
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.parts.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman

@@ -23,32 +23,43 @@ import numpy as np
 from consistency.bench.filters.compiled import variants
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy, fill, matrix, vector
-from consistency.bench.filters.kernel.blas import add_gram, product_of_transposed, solve_upper
-from consistency.bench.filters.kernel.covariance import definite_root, state_index
-from consistency.bench.filters.kernel.linalg import semidefinite_cholesky
+from consistency.bench.filters.kernel.linalg import (
+    add_gram,
+    copy,
+    fill,
+    matrix,
+    product_of_transposed,
+    semidefinite_cholesky,
+    solve_upper,
+    vector,
+)
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
     Slam,
     State,
+    add_motion_noise,
     correct,
     landmark_width,
     make_room,
+    move,
     observed_width,
     predict,
     predict_innovation,
+    propagate_covariance_root,
+    robot_frame,
     wrap_residual,
 )
-from consistency.bench.filters.kernel.unicycle import add_motion_noise, move, propagate_covariance_root, robot_frame
 from consistency.bench.filters.kernel.update_steps import (
     POSE,
     Work,
     add_noise,
     correct_at_once,
+    definite_root,
     gather,
     innovate,
     observe,
+    state_index,
 )
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.ukf import CUBATURE, UnscentedKalman

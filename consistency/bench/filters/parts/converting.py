@@ -16,7 +16,7 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import (
+from consistency.bench.filters.kernel.linalg import (
     blocks,
     copy,
     copy_matrix,
@@ -26,10 +26,24 @@ from consistency.bench.filters.kernel.arrays import (
     matrix,
     vector,
 )
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, multiply_columns, multiply_rows, replace_rows
-from consistency.bench.filters.kernel.part_functions import Slam, State, Triple, make_room, place, predict
-from consistency.bench.filters.kernel.unicycle import Frame, move, noise_columns
-from consistency.bench.filters.kernel.update_steps import Work
+from consistency.bench.filters.kernel.part_functions import (
+    Frame,
+    Slam,
+    State,
+    Triple,
+    make_room,
+    move,
+    noise_columns,
+    place,
+    predict,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    Work,
+    add_gram_to_state,
+    multiply_columns,
+    multiply_rows,
+    replace_rows,
+)
 from consistency.bench.filters.parts.invariant_pose import exponential, left_jacobian, move_pose
 from consistency.bench.filters.parts.inverse_range import (
     Pixels,

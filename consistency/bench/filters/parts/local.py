@@ -28,16 +28,18 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiler.dispatch import generic, implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill, fill_matrix
-from consistency.bench.filters.kernel.blas import (
+from consistency.bench.filters.kernel.linalg import (
     add_symmetric_product,
     add_times_transposed,
     add_transposed_times,
+    copy,
+    copy_matrix,
+    fill,
+    fill_matrix,
     product,
     symmetric_times,
     times_symmetric,
 )
-from consistency.bench.filters.kernel.covariance import across, gather_rows, mirror, state_index
 from consistency.bench.filters.kernel.part_functions import (
     Factors,
     Slam,
@@ -49,7 +51,7 @@ from consistency.bench.filters.kernel.part_functions import (
     prepare,
     settle,
 )
-from consistency.bench.filters.kernel.update_steps import Work
+from consistency.bench.filters.kernel.update_steps import Work, across, gather_rows, mirror, state_index
 from consistency.referee.types import Array, Indices
 
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy, fill, fill_matrix, filled_matrix, integers, matrix
-from consistency.bench.filters.kernel.covariance import gather_rows, replace_rows
+from consistency.bench.filters.kernel.linalg import copy, fill, fill_matrix, filled_matrix, integers, matrix
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Factors,
@@ -28,7 +27,7 @@ from consistency.bench.filters.kernel.part_functions import (
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.update_steps import Work
+from consistency.bench.filters.kernel.update_steps import Work, gather_rows, replace_rows
 from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.parts.local import (
     LOCAL_FROM,

@@ -6,12 +6,25 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.kernel.arrays import copy, copy_matrix, fill
-from consistency.bench.filters.kernel.blas import add_transposed_times
-from consistency.bench.filters.kernel.covariance import add_gram_to_state, gather_all_rows, replace_rows, state_index
-from consistency.bench.filters.kernel.part_functions import Data, Slam, State, correct, predict_innovation
-from consistency.bench.filters.kernel.unicycle import Frame, robot_frame
-from consistency.bench.filters.kernel.update_steps import Work, apply_beyond, divide_by_root
+from consistency.bench.filters.kernel.linalg import add_transposed_times, copy, copy_matrix, fill
+from consistency.bench.filters.kernel.part_functions import (
+    Data,
+    Frame,
+    Slam,
+    State,
+    correct,
+    predict_innovation,
+    robot_frame,
+)
+from consistency.bench.filters.kernel.update_steps import (
+    Work,
+    add_gram_to_state,
+    apply_beyond,
+    divide_by_root,
+    gather_all_rows,
+    replace_rows,
+    state_index,
+)
 from consistency.bench.filters.parts.converting import (
     Converting,
     ConvertingRoom,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from consistency.bench.filters.compiler.dispatch import implement, part
-from consistency.bench.filters.kernel.arrays import fill, fill_matrix
+from consistency.bench.filters.kernel.linalg import fill, fill_matrix
 from consistency.bench.filters.kernel.part_functions import (
+    Frame,
     Triple,
     combine,
     insert,
@@ -15,9 +16,8 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
-from consistency.bench.filters.kernel.unicycle import Frame
-from consistency.bench.models import point
-from consistency.bench.models.point import Mounting
+from consistency.bench.models import observation as point
+from consistency.bench.models.observation import Mounting
 from consistency.referee.types import Array
 
 

@@ -14,7 +14,10 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from consistency.bench.filters.believed_noise import sensor_noise
-from consistency.bench.models import motion, planar, point, stereo
+from consistency.bench.models import motion
+from consistency.bench.models import observation as planar
+from consistency.bench.models import observation as point
+from consistency.bench.models import observation as stereo
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import PLANAR_SENSORS, Belief, BelievedSensor
 from consistency.bench.types import Control, Gaussian, Info, Observation

@@ -10,15 +10,13 @@ import numpy as np
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.whitening import mean_and_count
-from consistency.referee.diagnostics.verdict.answers import STEP
-from consistency.referee.diagnostics.verdict.parts import Scale
+from consistency.referee.diagnostics.verdict.parts import STEP, Scale
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
 from consistency.referee.diagnostics.words.sentences import SPREAD
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import EXPECTED, LIMIT
-from consistency.referee.pages.judged_estimators import wide
-from consistency.referee.show.matplotlib_style import add_legend, band, canvas, curve, edges, log_axis, stroke
+from consistency.referee.document.blocks import EXPECTED, LIMIT, Figure
+from consistency.referee.pages.verdicts import wide
+from consistency.referee.show.figures import add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

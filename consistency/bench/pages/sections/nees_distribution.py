@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import EXPECTED, solid
-from consistency.referee.pages.judged_estimators import Estimator, Judged
-from consistency.referee.show.matplotlib_style import WIDTH, add_legend, band, canvas, curve, stroke
+from consistency.referee.document.blocks import EXPECTED, Figure, solid
+from consistency.referee.pages.verdicts import Estimator, Judged
+from consistency.referee.show.figures import WIDTH, add_legend, band, canvas, curve, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

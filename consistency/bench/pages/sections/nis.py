@@ -10,10 +10,9 @@ import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.words.numbers import names_in_a_row
-from consistency.referee.document.blocks import Figure
-from consistency.referee.document.colours import BAND, EXPECTED, Look
-from consistency.referee.pages.judged_estimators import wide
-from consistency.referee.show.matplotlib_style import canvas, dots, log_axis, owned, points, say, stroke
+from consistency.referee.document.blocks import BAND, EXPECTED, Figure, Look
+from consistency.referee.pages.verdicts import wide
+from consistency.referee.show.figures import canvas, dots, log_axis, owned, points, say, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -14,11 +14,23 @@ from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.runs.reproduce_findings import not_run_table
 from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
-from consistency.referee.document.blocks import Block, Cell, Column, Figure, Heading, Small, Stack, Status, Table, table
-from consistency.referee.document.wording import number, p_cell
+from consistency.referee.document.blocks import (
+    Block,
+    Cell,
+    Column,
+    Figure,
+    Heading,
+    Small,
+    Stack,
+    Status,
+    Table,
+    number,
+    p_cell,
+    table,
+)
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, reading
-from consistency.referee.show.matplotlib_style import add_legend, canvas, rows_of
+from consistency.referee.show.figures import add_legend, canvas, rows_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

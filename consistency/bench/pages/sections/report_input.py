@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.pages.judged_estimators import Estimator, Judged
+from consistency.referee.pages.verdicts import Estimator, Judged
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

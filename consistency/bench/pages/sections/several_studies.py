@@ -14,6 +14,8 @@ from consistency.bench.pages.sections.report_input import STEREO, Report, Study,
 from consistency.referee.diagnostics.verdict.parts import STATUSES, Interval
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, short
 from consistency.referee.document.blocks import (
+    BAND,
+    EXPECTED,
     Block,
     Column,
     Details,
@@ -26,13 +28,13 @@ from consistency.referee.document.blocks import (
     Settings,
     Table,
     Text,
+    solid,
     table,
 )
-from consistency.referee.document.colours import BAND, EXPECTED, solid
-from consistency.referee.document.judged_filters import BRIEF, Measure, cells, columns
-from consistency.referee.pages.manifest_facts import facts
+from consistency.referee.document.tables import BRIEF, Measure, cells, columns
 from consistency.referee.pages.verdicts import judgement, method
-from consistency.referee.show.matplotlib_style import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+from consistency.referee.pages.write_pages import facts
+from consistency.referee.show.figures import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 
-from consistency.bench.runs.local_workers import worker_count
+from consistency.bench.runs.workers import worker_count
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 

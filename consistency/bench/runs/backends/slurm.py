@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import submitit
 
-from consistency.bench.runs.local_workers import worker_count
+from consistency.bench.runs.workers import worker_count
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
 from consistency.referee.system.progress import say

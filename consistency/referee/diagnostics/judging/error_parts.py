@@ -1,34 +1,61 @@
-"""What the tests say about the errors of a sample, part by part: size, place, components, mean, shape and tails."""
+"""Every test that a sample allows, and what they say about its errors, part by part.
+
+The word that the answers lead to is in ``status``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.judging.fault_location import location_of
-from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, sided_p_value
-from consistency.referee.diagnostics.questions.anees_band import Band, simultaneous_band
-from consistency.referee.diagnostics.questions.bias import hotelling
-from consistency.referee.diagnostics.questions.equivalence import equivalence
+from consistency.referee.diagnostics.questions.bias_and_shape import (
+    Largest,
+    StepMoments,
+    hotelling,
+    largest_direction,
+    mean_shape,
+    pair_p_values,
+    sphericity,
+    step_moments,
+    t_squared,
+)
 from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.questions.scale import RunMeans, acceptance, pointwise_band, ratio_interval
-from consistency.referee.diagnostics.questions.shape import pair_p_values
-from consistency.referee.diagnostics.records.large_arrays import block_slices, by_runs
+from consistency.referee.diagnostics.questions.scale import (
+    Band,
+    MeanTest,
+    RunMeans,
+    acceptance,
+    equivalence,
+    pointwise_band,
+    ratio_interval,
+    scale_test,
+    simultaneous_band,
+)
+from consistency.referee.diagnostics.questions.tails import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import mean_of_runs, standardise
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import (
+from consistency.referee.diagnostics.records.whitening import (
+    are_unlike,
+    block_slices,
+    by_runs,
+    mean_of_runs,
+    standardise,
+)
+from consistency.referee.diagnostics.statistics.nees import (
+    Pit,
+    anees,
     coverage,
     coverage_interval,
     noncredibility,
+    pit,
     rmse,
 )
-from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.statistics.number_of_runs import detectable_ratio
-from consistency.referee.diagnostics.verdict.answers import (
+from consistency.referee.diagnostics.verdict.parts import (
     AXIS,
     BIAS,
     DIRECTION,
@@ -38,12 +65,6 @@ from consistency.referee.diagnostics.verdict.answers import (
     SHAPE,
     SHARES,
     STEP,
-    Settings,
-    at_share,
-    faults_of,
-    with_tolerated,
-)
-from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
     Answer,
     Bias,
@@ -55,8 +76,14 @@ from consistency.referee.diagnostics.verdict.parts import (
     Interval,
     Location,
     Scale,
+    Settings,
     Shape,
     Tails,
+    at_share,
+    faults_of,
+    least_of_steps,
+    shares_of,
+    with_tolerated,
 )
 from consistency.referee.types import Array, Indices
 
@@ -64,6 +91,7 @@ SIGN = 2.0  # standard errors from 0, of steps that are all one and the same, at
 NAMING = 0.5  # of the false-alarm rate: that a pair of axes is named where the factors of the axes alone are wrong
 VISIBLE = 0.05  # a stated correlation that is worth a word
 TINIEST = 1e-300
+GRID = 9  # ratios within the tolerance at which the distribution is compared
 
 
 def error_parts(
@@ -148,7 +176,7 @@ def scale_of(
         share_inside = float(inside[judged].mean())
     of_log = None
     if len(sample.nees) == 1:
-        from consistency.referee.diagnostics.planning.single_log import within
+        from consistency.referee.diagnostics.questions.planning import within
 
         of_log = within(sample.nees[0], dof, settings, shown.factor)
     accepted = acceptance(tests.main, dof, rate, settings.allow)
@@ -215,7 +243,7 @@ def by_group_of(
     both_sides = replace(settings, allow=None) if record.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
-    from consistency.referee.diagnostics.records.groups_by_column import spans_of
+    from consistency.referee.diagnostics.records.groups import spans_of
 
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)
@@ -407,3 +435,131 @@ def _sum_of_correlations(covariance: Array) -> Array:
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     rows = [(covariance[:, i] / (sigma[:, i, None] * sigma)).sum(axis=0) for i in range(sigma.shape[1])]
     return np.array(rows)
+
+
+@dataclass(frozen=True)
+class Tests:
+    """p value of each question, NaN where it cannot be asked, and intermediate results."""
+
+    p_values: Mapping[str, float]
+    main: MeanTest  # with runs of equal weight
+    band: Band
+    pit: Pit
+    axes: Mapping[str, MeanTest] = field(default_factory=dict)  # and groups
+    largest: Largest | None = None
+    outlier: Outlier | None = None
+    matrix: Array | None = None  # mean product of whitened errors, scaled
+    bias_step: int | None = None  # 1..T, with the smallest p value
+    shape_step: int | None = None
+    groups: tuple[MeanTest, ...] = ()  # of each group of runs and steps
+    named: Mapping[str, float] = field(default_factory=dict)  # p values that name a fault, once one is found
+
+
+def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], scale: float | None = None) -> Tests:
+    """Test every question that the sample allows.
+
+    Parameters
+    ----------
+    also : p values of other questions of the same verdict, among which the false-alarm rate is split
+    scale : p value of the main question, where it comes from elsewhere
+    """
+    of_runs = sample.run_means()
+    main = of_runs.name()
+    named = {MAIN: sided_p_value(main, settings)}
+    if scale is None:
+        scale = sided_p_value(of_runs.find(), settings)
+    p = {MAIN: scale}
+    axes: dict[str, MeanTest] = {}
+    largest = outlier = matrix = bias_step = shape_step = None
+    if sample.whitened is not None:
+        whitened = sample.whitened
+        in_steps = step_moments(whitened)
+        of_axes = {key: sample.run_means(index) for key, index in sample.components.items()}
+        axes = {key: of_axis.name() for key, of_axis in of_axes.items()}
+        p[AXIS] = float("nan")
+        if sample.dof > 1:
+            find = [of_axis.find() for of_axis in of_axes.values()]
+            for values, tests in ((named, axes.values()), (p, find)):
+                values[AXIS], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in tests]))
+        bias_step = _test_bias(sample, in_steps, p)
+        outlier = outliers(whitened, in_steps)
+        p["outliers"] = outlier.p_value
+        if settings.one_sided:
+            # runs may be conservative to different degrees: an outlier must be one for P, too
+            p["outliers"] = float(np.maximum(outlier.p_value, beyond_stated(whitened)))
+            largest = largest_direction(whitened)
+            p[DIRECTION] = largest.p_value
+        else:
+            matrix, shape_step = _test_shape(whitened, in_steps, p)
+    groups = group_tests(sample)
+    if groups:
+        p[GROUP], _ = least_of_steps(np.array([sided_p_value(test, settings) for test in groups]))
+    distribution = pit(sample.nees, sample.dof)
+    if not settings.one_sided:
+        p["distribution"] = _distribution(sample, settings, distribution)
+    asked = [question for question, value in (dict(also) | p).items() if np.isfinite(value)]
+    rate = shares_of(dict.fromkeys([*asked, STEP]))[STEP] * settings.false_alarm
+    band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
+    if sample.nees.shape[1] > 1:
+        p[STEP] = band.p_value
+    if not are_unlike(sample.counts):
+        named = {}
+    return Tests(p, main, band, distribution, axes, largest, outlier, matrix, bias_step, shape_step, groups, named)
+
+
+def sided_p_value(test: MeanTest, settings: Settings) -> float:
+    """Two-sided, or against a covariance that is too small where nothing else is a fault."""
+    if settings.one_sided:
+        return test.above
+    return test.p_value
+
+
+def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
+    """Test of the scale in each group of runs and steps by itself; none where groups do not convict."""
+    if sample.groups is None or sample.groups.outcome:
+        return ()
+    tests = []
+    for number in range(len(sample.groups.names)):
+        in_group = sample.in_group(number)
+        tests.append(scale_test(in_group.means, sample.dof, in_group.longest, weights=in_group.counts))
+    return tuple(tests)
+
+
+def _distribution(sample: Sample, settings: Settings, distribution: Pit) -> float:
+    """p value of the distribution of the NEES: the largest over the ratios that are tolerated."""
+    largest = distribution.p_value
+    if settings.tolerated > 1.0:
+        for ratio in np.geomspace(1.0 / settings.tolerated, settings.tolerated, GRID):
+            largest = max(largest, pit(sample.nees / ratio, sample.dof).p_value)
+    return largest
+
+
+def _test_bias(sample: Sample, in_steps: StepMoments, p: dict[str, float]) -> int | None:
+    """Put the p values of a mean error into ``p``; the step with the smallest, 1..T."""
+    whitened = sample.whitened
+    assert whitened is not None
+    of_runs = mean_of_runs(whitened)
+    of_runs = of_runs[np.isfinite(of_runs).all(axis=-1)]
+    p["bias"] = float("nan")
+    if len(of_runs) > whitened.shape[-1]:
+        p["bias"] = hotelling(of_runs).p_value
+        if are_unlike(sample.counts):
+            p["bias"] = max(p["bias"], hotelling(of_runs * sample.counts[:, None]).p_value)
+    if whitened.shape[1] == 1:
+        return None
+    _, steps = t_squared(whitened, in_steps)
+    p["bias in some step"], step = least_of_steps(steps)
+    return step
+
+
+def _test_shape(whitened: Array, in_steps: StepMoments, p: dict[str, float]) -> tuple[Array, int | None]:
+    """Put the p values of the shape into ``p``; the mean products, and the step with the smallest p value, 1..T."""
+    _, steps = sphericity(whitened, in_steps)
+    matrix, over_runs = mean_shape(whitened)
+    in_step, step = least_of_steps(steps)
+    if whitened.shape[1] == 1:
+        p["shape"] = in_step
+    else:
+        p["shape"] = over_runs
+        p["shape in some step"] = in_step
+    return matrix, step

@@ -1,4 +1,7 @@
-"""Every test of a record's errors and innovations, and the status that follows from them."""
+"""Every test of a record's errors and innovations, and the status that follows.
+
+Components whose cross terms are not stated are tested one by one. The tests themselves are in ``error_parts``.
+"""
 
 from __future__ import annotations
 
@@ -10,32 +13,49 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.error_parts import accuracy_of, bias_of, error_parts, excused
-from consistency.referee.diagnostics.judging.hypothesis_tests import run_tests
+from consistency.referee.diagnostics.judging.error_parts import accuracy_of, bias_of, error_parts, excused, run_tests
 from consistency.referee.diagnostics.judging.status import (
+    few_lost,
     nothing_judged,
     status_by_errors,
     status_by_innovations,
     status_without_fault,
     withheld,
 )
-from consistency.referee.diagnostics.questions.bias import t_squared
-from consistency.referee.diagnostics.questions.equivalence import (
+from consistency.referee.diagnostics.questions.bias_and_shape import t_squared
+from consistency.referee.diagnostics.questions.sample import (
+    Sample,
+    impossible_values,
+    names_of,
+    runs_and_steps,
+    sample_of,
+)
+from consistency.referee.diagnostics.questions.scale import (
+    FEW,
     equivalence,
     equivalence_by_betting,
     equivalence_of_total,
     is_tolerated,
+    ratio_interval,
+    run_means,
     worst,
 )
-from consistency.referee.diagnostics.questions.lost_runs import early_ends, lost_of
-from consistency.referee.diagnostics.questions.sample import Sample, impossible_values, runs_and_steps, sample_of
-from consistency.referee.diagnostics.records.large_arrays import every_entry
+from consistency.referee.diagnostics.questions.tails import early_ends, lost_of
 from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
 from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
-from consistency.referee.diagnostics.verdict.answers import (
+from consistency.referee.diagnostics.verdict.parts import (
     JOINT,
     MAIN,
+    SHARES,
+    Answer,
+    EarlyEnds,
+    Equivalence,
+    ErrorParts,
+    Innovations,
+    Lost,
+    Scale,
     Settings,
     answers,
     faults_of,
@@ -43,23 +63,19 @@ from consistency.referee.diagnostics.verdict.answers import (
     named_p_values,
     with_tolerated,
 )
-from consistency.referee.diagnostics.verdict.parts import (
-    Answer,
-    EarlyEnds,
-    Equivalence,
-    ErrorParts,
-    Innovations,
-)
 from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings
+from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.imperfect_truth.uncertain_truth import UncertainTruth
-    from consistency.referee.diagnostics.maps.map_nees import JointTest
+    from consistency.referee.diagnostics.questions.maps import JointTest
+    from consistency.referee.diagnostics.questions.uncertain_truth import UncertainTruth
+
+INNOVATIONS = "innovations"
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.planning.early_stopping`."""
+    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.questions.planning`."""
 
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
     # None where nothing but the scale is asked
@@ -193,7 +209,7 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
     """What the innovations say, and the p values of their questions where an optimal gain is declared."""
     if record.nis is None and record.innovations is None:
         return None, {}
-    from consistency.referee.diagnostics.questions.innovations import (
+    from consistency.referee.diagnostics.questions.whiteness import (
         nis_and_dof,
         nis_test,
         nis_whiteness,
@@ -233,7 +249,7 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
 def _joint(record: Record, settings: Settings) -> JointTest | None:
     if record.joint is None:
         return None
-    from consistency.referee.diagnostics.maps.map_nees import joint_test
+    from consistency.referee.diagnostics.questions.maps import joint_test
 
     return joint_test(record.joint, settings, record.run_numbers, record.landmarks)
 
@@ -320,3 +336,158 @@ def _parts_of_estimate(
             parts.accuracy, rmse=size.rmse, rmse_position=size.rmse_position, rmse_heading=size.rmse_heading
         ),
     )
+
+
+def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> Findings:
+    """Judge each part of a record by itself; see ``Record.parts``.
+
+    A part is a component, or several whose cross terms are stated. Of two parts only the marginal covariances are
+    known, and a NEES with cross terms of 0 is not chi-square unless the errors are uncorrelated. All questions are
+    asked of each part, and of the innovations if these are judged, at a false-alarm rate that Holm's procedure (1979)
+    divides: whatever the correlations, a right estimator is found at fault in any part with probability
+    ``false_alarm`` at most. It is *consistent* if every part is, each at ``power``. The mean of the whole NEES is
+    expected to be n under any correlation; it is reported and not judged.
+
+    Parameters
+    ----------
+    unshown : why nothing can be shown, as for :func:`findings_of`
+
+    Raises
+    ------
+    ValueError
+        As :func:`consistency.diagnostics.judge`.
+    """
+    if unshown:
+        record = replace(record, unavailable=tuple(SHARES))
+    parts = _by_holm(_records_of_parts(record), settings)
+    whole = findings_of(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
+    nees = _nees_over_n(record)
+    lost = lost_of(record, nees, 1, settings)  # a mean of chi-square(1), however they depend on each other
+    innovations = whole.innovations
+    accuracy = whole.accuracy
+    scale = whole.scale
+    if INNOVATIONS in parts:
+        innovations = parts[INNOVATIONS].innovations
+    if accuracy is not None:
+        accuracy = replace(accuracy, nci=float("nan"), inclination=float("nan"))
+    if scale is not None:
+        scale = _scale_of_whole(scale, parts, record, nees)
+    unshown, status, scale = withheld(unshown, _status(list(parts.values()), lost, settings), scale)
+    return replace(
+        whole,
+        status=status,
+        settings=settings,
+        answers=tuple(_answers(parts, settings)),
+        scale=scale,
+        parts=parts,
+        lost=lost,
+        location=None,
+        by_group=None,
+        shape=None,
+        tails=None,
+        accuracy=accuracy,
+        innovations=innovations,
+        unshown=unshown,
+    )
+
+
+def _records_of_parts(record: Record) -> dict[str, Record]:
+    """A record of the errors of each part, and one of the innovations if they are judged."""
+    names = names_of(record)
+    axes = record.axes or names
+    assert record.error is not None
+    covariance = np.asarray(record.covariance, float)
+    records = {}
+    for index in record.parts:
+        some = list(index)
+        records[", ".join(names[i] for i in index)] = replace(
+            record,
+            error=record.error[..., some],
+            covariance=covariance[..., some, :][..., some],
+            dof=len(some),
+            axes=tuple(axes[i] for i in index),
+            parts=(),
+            nis=None,
+            nis_dof=None,
+            innovations=None,
+            innovation_covariances=None,
+            optimal_gain=False,
+        )
+    if record.optimal_gain and record.nis is not None:
+        records[INNOVATIONS] = replace(record, error=None, covariance=None, nees=None, dof=0, parts=())
+    return records
+
+
+def _by_holm(records: Mapping[str, Record], settings: Settings) -> dict[str, Findings]:
+    """Findings of all parts; those without a fault are asked again at what the others leave of the rate."""
+    found: dict[str, Findings] = {}
+    left = list(records)
+    while left:
+        at = replace(settings, false_alarm=settings.false_alarm / len(left), subsets=None, lost=None)
+        for name in left:
+            found[name] = findings_of(records[name], at)
+        right = [name for name in left if not found[name].faults]
+        if len(right) == len(left):
+            break
+        left = right
+    return {name: found[name] for name in records}
+
+
+def _nees_over_n(record: Record) -> Array:
+    """NEES by the stated variances over the number of components, (runs, steps); NaN where it does not count."""
+    assert record.error is not None
+    assert record.covariance is not None
+    nees = squared_length(whiten(record.error, record.covariance)) / record.error.shape[-1]
+    counted = np.isfinite(nees)
+    if record.nees is not None:
+        counted = np.isfinite(record.nees)
+    return np.where(counted, nees, np.nan)
+
+
+def _scale_of_whole(whole: Scale, parts: Mapping[str, Findings], record: Record, nees: Array) -> Scale:
+    """The size of all errors, with what is known of it whatever the correlations."""
+    scales = [part.scale for part in parts.values() if part.scale is not None]
+    means, counts = run_means(nees)
+    inflation = whole.inflation
+    if counts.astype(bool).sum() < FEW:  # the errors of all parts may be the same
+        inflation = ratio_interval(means[counts > 0], min(map(len, record.parts)))
+    return replace(
+        whole,
+        inflation=inflation,
+        band=np.full_like(whole.band, np.nan),
+        accepted=UNKNOWN_ENDS,
+        share_inside=float("nan"),
+        within=None,
+        detectable=max(scale.detectable for scale in scales),
+        equivalence=worst([scale.equivalence for scale in scales]),
+    )
+
+
+def _answers(parts: Mapping[str, Findings], settings: Settings) -> list[Answer]:
+    """Answers of all parts, corrected for their number."""
+    given = []
+    for name, part in parts.items():
+        among = settings.false_alarm / part.settings.false_alarm  # parts that shared the rate with it
+        for answer in part.answers:
+            adjusted = min(1.0, answer.adjusted * among)
+            question = f"{answer.question} of {name}"
+            share = answer.share / len(parts)
+            given.append(replace(answer, question=question, share=share, adjusted=adjusted))
+    return given
+
+
+def _status(parts: Sequence[Findings], lost: Lost | None, settings: Settings) -> str:
+    """That of the parts at fault where they agree; a bias beside a wrong size is named in the sentence alone."""
+    faults = {part.status for part in parts if part.faults}
+    if faults - {"biased"}:
+        faults.discard("biased")
+    if len(faults) > 1:
+        return "inconsistent"
+    if faults:
+        return faults.pop()
+    statuses = {part.status for part in parts}
+    if "failed" in statuses:
+        return "failed"
+    if statuses == {"consistent"} and few_lost(lost, settings):
+        return "consistent"
+    return "undecided"

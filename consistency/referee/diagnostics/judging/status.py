@@ -7,11 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.hypothesis_tests import Tests, run_tests, sided_p_value
+from consistency.referee.diagnostics.judging.error_parts import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.questions.scale import (
+    MeanTest,
+    scale_test,
+    spreads_more,
+    spreads_more_in_steps,
+)
 from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.answers import (
+from consistency.referee.diagnostics.verdict.parts import (
     AXIS,
     BIAS,
     DIRECTION,
@@ -22,12 +27,6 @@ from consistency.referee.diagnostics.verdict.answers import (
     SCALE,
     SHARES,
     STEP,
-    Settings,
-    answers,
-    at_share,
-    faults_of,
-)
-from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Answer,
     ErrorParts,
@@ -35,12 +34,16 @@ from consistency.referee.diagnostics.verdict.parts import (
     Interval,
     Lost,
     Scale,
+    Settings,
+    answers,
+    at_share,
+    faults_of,
 )
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.maps.map_nees import JointTest
+    from consistency.referee.diagnostics.questions.maps import JointTest
 
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 

@@ -10,22 +10,25 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.questions.scale import RunMeans, means_and_counts, run_means
-from consistency.referee.diagnostics.records.large_arrays import by_runs, by_steps, every_entry, of_runs
 from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.valid_covariances import negative
 from consistency.referee.diagnostics.records.whitening import (
     all_finite,
     are_unlike,
+    by_runs,
+    by_steps,
+    every_entry,
+    negative,
+    of_runs,
     squared_length,
     whiten,
     whiten_group,
 )
 from consistency.referee.diagnostics.statistics.nees import EarlyMeans
-from consistency.referee.diagnostics.verdict.answers import Settings
+from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups_by_column import Groups
+    from consistency.referee.diagnostics.records.groups import Groups
 
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}

@@ -1,17 +1,24 @@
-"""Errors in units of their stated covariance."""
+"""Errors in units of their stated covariance, whether that is one, and work on large arrays block by block."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.large_arrays import FEW, block_slices, by_runs
 from consistency.referee.types import Array, Indices
 
 LARGE = 40  # components from which on LAPACK, matrix by matrix, is faster than all matrices entry by entry
 NUMBERS = 2**22  # of matrices that are factored in one call
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+DEFICIENT = 1e-12  # eigenvalue of a correlation matrix below which a direction carries no uncertainty
+NEGATIVE = 1e-9  # of the largest entry: an eigenvalue further below zero is not rounding, in any unit
+ROWS = 2**18  # pairs of run and step in a block
+FEW = 7  # components that NumPy adds one after the other; sums over so short an axis are slow
+FEWER = 2**16  # in a block of whole runs, which lies together in memory: what is worked out of it stays in the cache
 
 
 def whiten(error: Array, covariance: Array) -> Array:
@@ -185,3 +192,126 @@ def spread_steps(present: Array) -> Array:
     counts = present.sum(axis=1)
     of_runs = from_place if are_unlike(counts[counts > 0]) else of_block
     return by_runs(of_runs, present, np.mod(0.5 + np.arange(len(present)) * GOLDEN, 1.0))
+
+
+class Validity(IntEnum):
+    """Classes of :func:`classify`; where several hold, the last of them."""
+
+    VALID = 0
+    DEFICIENT = 1  # positive semidefinite: a direction carries no uncertainty
+    INDEFINITE = 2
+    ASYMMETRIC = 3
+    NOT_FINITE = 4
+
+
+class Tolerance(NamedTuple):
+    """Limits of rounding errors."""
+
+    asymmetry: float  # of the largest entry
+    indefinite: float  # eigenvalue of a correlation matrix, below zero
+    zero: float  # variance that counts as none, in its own unit
+
+
+EXACT = Tolerance(asymmetry=1e-8, indefinite=DEFICIENT, zero=0.0)  # arrays of doubles
+# text files of seven digits; of fewer, a singular matrix; variances of nothing as in the filters of this package
+ROUNDED = Tolerance(asymmetry=1e-6, indefinite=1e-4, zero=1e-24)
+
+
+def classify(covariance: Array, tolerance: Tolerance = EXACT) -> Indices:
+    """:class:`Validity` of each matrix, (..., n, n) -> (...), in any units of the components.
+
+    Rank is judged by the smallest eigenvalue of the correlation matrix, where a component whose variance is zero has
+    the variance 1 and the covariances that it has.
+    """
+    P = covariance.reshape(-1, *covariance.shape[-2:])
+    return by_runs(lambda some: _classify(some, tolerance), P).reshape(covariance.shape[:-2])
+
+
+def _classify(P: Array, tolerance: Tolerance) -> Indices:
+    finite = np.isfinite(P).all(axis=(-2, -1))
+    out = np.full(len(P), Validity.NOT_FINITE, dtype=np.int64)
+    P = P[finite]
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
+    none = np.abs(variance) <= tolerance.zero
+    scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
+    smallest = np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[:, 0]
+    smallest = np.where(none.any(axis=-1), np.minimum(smallest, 0.0), smallest)
+    kind = np.where(smallest > DEFICIENT, Validity.VALID, Validity.DEFICIENT)
+    kind[smallest < -tolerance.indefinite] = Validity.INDEFINITE
+    kind[asymmetric(P, tolerance)] = Validity.ASYMMETRIC
+    out[finite] = kind
+    return out
+
+
+def asymmetric(covariance: Array, tolerance: Tolerance = EXACT) -> Array:
+    """Which matrices (..., n, n) differ from their transpose by more than rounding; not those that are not finite."""
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(axis=(-2, -1))
+    return np.asarray(gap > tolerance.asymmetry * np.abs(covariance).max(axis=(-2, -1)))
+
+
+def negative(covariance: Array) -> Array:
+    """Which finite matrices (N, n, n) have a negative variance in some direction that is not rounding in any unit.
+
+    More lenient than :attr:`Validity.INDEFINITE`, so that a covariance that lost its rank is not called impossible.
+    """
+    if not len(covariance):
+        return np.zeros(0, bool)
+    return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] < -NEGATIVE * np.abs(covariance).max(axis=(-2, -1)))
+
+
+def diagonal(deviations: Array) -> Array:
+    """Covariances of standard deviations without cross terms, (..., n) -> (..., n, n); indefinite of a negative one."""
+    sigma = np.asarray(deviations, float)
+    n = sigma.shape[-1]
+    P = np.zeros((*sigma.shape, n))
+    P[..., range(n), range(n)] = sigma * np.abs(sigma)  # infinite ones leave the zeros as they are
+    return P
+
+
+def every_entry(holds: Callable[[Array], Array], matrices: Array) -> Array:
+    """Where ``holds``, asked of arrays (...), is true of every entry of matrices (..., n, n); (...) of bool."""
+    n = matrices.shape[-1]
+    if n > FEW:
+        return np.asarray(holds(matrices).all(axis=(-2, -1)))
+    out = np.ones(matrices.shape[:-2], bool)
+    for i, j in np.ndindex(n, n):
+        out &= holds(matrices[..., i, j])
+    return out
+
+
+def block_slices(count: int, each: int, rows: int | None = None) -> Iterator[slice]:
+    """Slices of an axis of ``count`` places with ``each`` rows at a place; at least one slice, which may be empty."""
+    if rows is None:
+        rows = ROWS
+    size = max(rows // max(each, 1), 1)
+    for start in range(0, max(count, 1), size):
+        yield slice(start, start + size)
+
+
+def of_runs(array: Array) -> Iterator[slice]:
+    """Slices of the runs of an array (runs, steps, ...), or of the rows of one (rows, n)."""
+    return block_slices(len(array), math.prod(array.shape[1:2]), FEWER)
+
+
+def by_runs(function: Callable[..., Array], first: Array, *others: Array) -> Array:
+    """Apply ``function``, which works on each run separately, to arrays (runs, ...) block by block."""
+    slices = list(of_runs(first))
+    if len(slices) == 1:
+        return function(first, *others)
+    out = np.empty(0)
+    for here in slices:
+        part = function(first[here], *(array[here] for array in others))
+        if here.start == 0:
+            out = np.empty((len(first), *part.shape[1:]), part.dtype)
+        out[here] = part
+    return out
+
+
+def by_steps(function: Callable[..., Array], *arrays: Array) -> Array:
+    """Apply ``function``, which works on each step separately, to arrays (runs, steps, ...) block by block."""
+    runs, steps = arrays[0].shape[:2]
+    parts = []
+    for here in block_slices(steps, runs):
+        parts.append(function(*(array[:, here] for array in arrays)))
+    return np.concatenate(parts)

@@ -1,4 +1,4 @@
-"""Distribution functions of the tests: those of :mod:`scipy.stats`, from :mod:`scipy.special`.
+"""Distribution functions of the tests, from :mod:`scipy.special` because :mod:`scipy.stats` is slow, and normality.
 
 Loading :mod:`scipy.stats` costs as much as loading all else that a verdict needs.
 """
@@ -6,6 +6,7 @@ Loading :mod:`scipy.stats` costs as much as loading all else that a verdict need
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ from consistency.referee.types import Array
 EXACT = 140  # values up to which Kolmogorov's distribution is computed here; SciPy approximates it for more
 MOST = 0.95  # p value that is combined with others
 CERTAIN = 4.0  # N d^2 from which twice the one-sided tail is the two-sided one to 14 digits
-
 Value = Any  # a number or an array; what comes back has the shape to which all arguments broadcast
+FARTHEST = 1e6  # times the largest weight: the tail beyond it is 0 in floating point
 
 
 class ChiSquare:
@@ -162,9 +163,6 @@ def combined_p_value(p_values: Sequence[float], weights: Sequence[float]) -> flo
     return float(np.arctan2(1.0, np.dot(weights, 1.0 / np.tan(np.pi * p))) / np.pi)
 
 
-FARTHEST = 1e6  # times the largest weight: the tail beyond it is 0 in floating point
-
-
 def weighted_chi_square_tail(value: float, weights: Array) -> float:
     """P(sum of weights times independent chi-square(1) > value) by saddlepoint, ``weights`` (k,) not negative.
 
@@ -192,3 +190,39 @@ chi2 = ChiSquare
 t = Student
 beta = Beta
 kolmogorov = Kolmogorov
+
+
+@dataclass(frozen=True)
+class Normality:
+    """Moments of one component and the omnibus test of D'Agostino & Pearson (1973)."""
+
+    mean: float
+    std: float
+    skewness: float
+    excess_kurtosis: float
+    statistic: float  # chi-square with 2 degrees of freedom under normality
+    p_value: float
+
+
+def normality(sample: Array) -> Normality:
+    """Moments and K-squared test of a sample (N,), N >= 20.
+
+    Raises
+    ------
+    ValueError
+        Too few or not finite values.
+    """
+    from scipy import stats  # slow to load, and no verdict needs it
+
+    sample = np.asarray(sample, float)
+    if sample.ndim != 1 or len(sample) < 20 or not np.isfinite(sample).all():
+        raise ValueError(f"needs at least 20 finite values in one dimension, got shape {sample.shape}")
+    test = stats.normaltest(sample)
+    return Normality(
+        float(sample.mean()),
+        float(sample.std(ddof=1)),
+        float(stats.skew(sample)),
+        float(stats.kurtosis(sample)),
+        float(test.statistic),
+        float(test.pvalue),
+    )

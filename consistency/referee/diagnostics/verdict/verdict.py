@@ -1,4 +1,7 @@
-"""The verdict on one filter: what the tests found, the status that follows, and the sentences that say so."""
+"""The verdict on one filter.
+
+What the tests found, the status that follows, the sentences that say so, and all of it as dictionaries for programs.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record, shown_by
-from consistency.referee.diagnostics.verdict.answers import Settings, faults_of
+from consistency.referee.diagnostics.records.record import Record, Skipped, shown_by
 from consistency.referee.diagnostics.verdict.parts import (
     TINY,
     Accuracy,
@@ -28,19 +30,20 @@ from consistency.referee.diagnostics.verdict.parts import (
     Lost,
     RejectionScore,
     Scale,
+    Settings,
     Shape,
     Tails,
     TruthShare,
+    Within,
+    faults_of,
 )
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
-if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.skipped_start import Skipped
-
 CLOCK = 1e8  # s, three years: times above are of a clock that does not start with the runs
 MICROSECOND = 6  # digits behind the point
 UNKNOWN_ENDS = (float("nan"), float("nan"))
+Numbers = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -315,7 +318,6 @@ def _map_numbers(score: MapScore) -> dict[str, Any]:
 
 def _statistics_of(v: Verdict) -> dict[str, Any]:
     """Every number of a verdict; those of parts that could not be computed are left out."""
-    from consistency.referee.diagnostics.verdict import as_dictionary as dictionary
 
     numbers: dict[str, Any] = {
         "runs": v.runs,
@@ -333,29 +335,29 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
         "left_out_steps": list(v.left_out_steps),
     }
     parts: list[tuple[Any, Callable[[Any], dict[str, Any]]]] = [
-        (v.scale, dictionary.scale_numbers),
-        (v.lost, partial(dictionary.lost_numbers, v.settings.lost)),
-        (v.location, dictionary.location_numbers),
+        (v.scale, scale_numbers),
+        (v.lost, partial(lost_numbers, v.settings.lost)),
+        (v.location, location_numbers),
         (v.axes, partial(_axes_numbers, v)),
-        (v.bias, dictionary.bias_numbers),
-        (v.shape, dictionary.shape_numbers),
-        (v.tails, dictionary.tails_numbers),
-        (v.innovations, dictionary.innovations_numbers),
+        (v.bias, bias_numbers),
+        (v.shape, shape_numbers),
+        (v.tails, tails_numbers),
+        (v.innovations, innovations_numbers),
         (v.accuracy, vars),
         (v.map, _map_numbers),
         (v.landmarks, lambda labels: {"landmarks": list(labels)}),
-        (v.joint, dictionary.joint_numbers),
-        (v.rejection, dictionary.rejection_numbers),
-        (v.ends, dictionary.ends_numbers),
-        (v.skipped, dictionary.skipped_numbers),
+        (v.joint, joint_numbers),
+        (v.rejection, rejection_numbers),
+        (v.ends, ends_numbers),
+        (v.skipped, skipped_numbers),
         (v.guesses or None, _guess_numbers),
-        (v.truth, dictionary.truth_numbers),
-        (v.by_group, dictionary.group_numbers),
+        (v.truth, truth_numbers),
+        (v.by_group, group_numbers),
     ]
     for part, numbers_of in parts:
         if part is not None:
             numbers |= numbers_of(part)
-    of_parts = {name: dictionary.group_numbers(part.by_group)["by"] for name, part in v.parts.items() if part.by_group}
+    of_parts = {name: group_numbers(part.by_group)["by"] for name, part in v.parts.items() if part.by_group}
     if of_parts:
         numbers["by_part"] = of_parts
     if v.convention is not None or v.notes:
@@ -363,3 +365,169 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
     if v.world is not None:
         numbers["world"] = v.world.as_dictionary()
     return numbers
+
+
+def scale_numbers(scale: Scale) -> Numbers:
+    return {
+        "dof": scale.dof,
+        "anees": scale.anees,
+        "alive": scale.alive,
+        "band": scale.band,
+        "judged_steps": scale.judged_steps,
+        "mean_anees": scale.mean_anees,
+        "acceptance": scale.accepted,
+        "effective_dof": scale.effective_dof,
+        "ratio": scale.inflation.value,
+        "ratio_interval": tuple(scale.inflation[1:]),
+        "detectable": scale.detectable,
+        "median_run": scale.median_run,
+        "worst_run": scale.worst_run,
+        "share_inside": scale.share_inside,
+        "equivalence": equivalence_numbers(scale.equivalence),
+        "within": _of_within(scale.within),
+    }
+
+
+def _of_within(within: Within | None) -> Numbers | None:
+    if within is None:
+        return None
+    return {
+        "ratio": within.ratio.value,
+        "ratio_interval": tuple(within.ratio[1:]),
+        "correlation_steps": within.correlation,
+        "effective_dof": within.effective_dof,
+        "deciding_steps": within.steps,
+        "deciding_pieces": within.pieces,
+    }
+
+
+def equivalence_numbers(equivalence: Equivalence | None) -> Numbers | None:
+    if equivalence is None:
+        return None
+    return vars(equivalence) | {"shown": equivalence.shown}
+
+
+def lost_numbers(asked: float | None, lost: Lost) -> Numbers:
+    return {"lost": {"asked": asked} | vars(lost)}
+
+
+def location_numbers(location: Location) -> Numbers:
+    until = None
+    if location.until is not None:
+        until = location.until.step
+    return vars(location) | {"until": until}
+
+
+def bias_numbers(bias: Bias) -> Numbers:
+    by_axis = {axis: tuple(interval) for axis, interval in bias.by_axis.items()}
+    numbers: Numbers = {"bias": by_axis, "bias_step": bias.step}
+    if bias.inflation_without is not None:
+        numbers["ratio_without_bias"] = tuple(bias.inflation_without)
+        numbers["bias_axis"] = bias.axis
+        numbers["bias_in_step"] = bias.size
+    return numbers
+
+
+def shape_numbers(shape: Shape) -> Numbers:
+    a, b = shape.pair or (None, None)
+    return {
+        "shape": shape.matrix,
+        "shape_step": shape.step,
+        "correlation": [a, b, shape.actual, shape.stated],
+        "correlation_wrong_sign": shape.wrong_sign,
+    }
+
+
+def tails_numbers(tails: Tails) -> Numbers:
+    outlier = {"run": tails.run, "step": tails.step, "distance": tails.distance}
+    return {"outlier": outlier, "pit": tails.pit, "pit_half_width": tails.half_width}
+
+
+def innovations_numbers(innovations: Innovations) -> Numbers:
+    numbers = {
+        "nis_ratio": innovations.ratio,
+        "nis_interval": list(innovations.interval),
+        "nis_dof": innovations.dof,
+        "nis_judged": innovations.judged,
+        "autocorrelation": innovations.autocorrelation,
+        "autocorrelation_bound": innovations.bound,
+        "nis_equivalence": equivalence_numbers(innovations.equivalence),
+    }
+    if innovations.outliers is not None:
+        numbers["nis_outliers"] = vars(innovations.outliers) | {"rest": innovations.outliers.rest.ratio}
+    return numbers
+
+
+def joint_numbers(joint: JointScore) -> Numbers:
+    return {
+        "joint_ratio": joint.both.value,
+        "joint_ratio_interval": tuple(joint.both[1:]),
+        "joint_pose": tuple(joint.pose),
+        "joint_map": tuple(joint.map),
+        "joint_runs": joint.runs,
+        "joint_dof": joint.dof,
+        "joint_chief": list(joint.chief),
+        "joint_not_definite": list(joint.not_definite),
+    }
+
+
+def rejection_numbers(rejection: RejectionScore) -> Numbers:
+    return {
+        "rejected": rejection.rejected,
+        "offered": rejection.offered,
+        "spurious": rejection.spurious,
+        "rejection_precision": tuple(rejection.precision),
+        "rejection_recall": tuple(rejection.recall),
+        "rejection_false_alarms": tuple(rejection.false_alarms),
+    }
+
+
+def ends_numbers(ends: EarlyEnds) -> Numbers:
+    return {"early_ends": vars(ends) | {"lost": ends.lost}}
+
+
+def skipped_numbers(skipped: Skipped) -> Numbers:
+    return {"skip": skipped.skip.option, "skipped_steps": skipped.steps, "skipped_runs": skipped.empty}
+
+
+def truth_numbers(truth: TruthShare) -> Numbers:
+    return {
+        "truth_share": truth.share,
+        "truth_share_of_axes": dict(truth.by_axis),
+        "truth_errors": truth.errors,
+        "truth_shared": truth.shared,
+    }
+
+
+def group_numbers(by: ByGroup) -> Numbers:
+    groups = [
+        {
+            "name": group.name,
+            "status": group.status,
+            "runs": group.runs,
+            "steps": group.steps,
+            "ratio": group.ratio.value,
+            "ratio_interval": tuple(group.ratio[1:]),
+            "p_value": group.p_value,
+            "equivalence": equivalence_numbers(group.equivalence),
+        }
+        for group in by.groups
+    ]
+    return {"by": {"column": by.column, "groups": groups, "outcome": by.outcome, "without": by.without}}
+
+
+def plain(value: Any) -> Any:
+    """Verdicts as dictionaries, arrays as lists, not finite numbers as None: what JSON can hold."""
+    if hasattr(value, "as_dictionary"):
+        return plain(value.as_dictionary())
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,28 +1,74 @@
-"""A fault in words, each in the same order: what is wrong, by how much, and where."""
+"""Faults in words, the chief one first, each in the same order: what is wrong, by how much, and where.
+
+In all runs, in groups of them, or in blocks of the state.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import VISIBLE
-from consistency.referee.diagnostics.verdict.answers import AXIS, DIRECTION, MAIN, STEP
-from consistency.referee.diagnostics.verdict.parts import SIDES, TINY, Innovations, Interval, JointScore
+from consistency.referee.diagnostics.judging.status import smaller
+from consistency.referee.diagnostics.questions.scale import FEW
+from consistency.referee.diagnostics.records.groups import range_name
+from consistency.referee.diagnostics.verdict.parts import (
+    ALONE,
+    AXIS,
+    BIAS,
+    DIRECTION,
+    GROUP,
+    JOINT,
+    MAIN,
+    SCALE,
+    SHAPE,
+    SIDES,
+    STEP,
+    TINY,
+    ByGroup,
+    ComponentRatios,
+    Group,
+    Innovations,
+    Interval,
+    JointScore,
+    Scale,
+)
 from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.diagnostics.words.numbers import (
     MOST,
     SIDE,
+    SMALLEST_P,
+    is_or_are,
     is_uncertain,
+    names_in_a_row,
     off_by,
     off_by_factor,
+    p_text,
     plural,
     ratio_text,
     short,
     since_text,
 )
-from consistency.referee.diagnostics.words.unlike_factors import factors_text, names_to_say, unlike_ratios, unlike_text
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step
 NAMED_PART = 0.1  # part of a unit vector that a sentence names
+CHIEF_QUESTIONS = {
+    "biased": BIAS,
+    "heavy-tailed": ["outliers"],
+    "overconfident": SCALE,
+    "conservative": SCALE,
+}  # by statuses
+BLOCKS = ("position", "attitude", "velocity")
+NEAR = 1.3  # ratio of each axis of a block that is called right: with more, an axis wrong by 1.5 hides in it too often
+NARROW = 1.25  # upper over lower end of a ratio that tells such factors from others
+CEP = 1.386  # 2 log 2
+LEVELS = {
+    3.84: "deviations stated at 95 % (1.96 sigma)",
+    4.0: "deviations of 2 sigma",
+    CEP: "a CEP in place of deviations (the radius of 50 % in the plane, 1.1774 sigma)",
+}  # by the factor on a variance, the squares of these multiples
+MUCH = 100_000  # runs; more are no advice
 
 # --- the scale ---------------------------------------------------------------------------------------
 
@@ -328,3 +374,264 @@ def _chief_landmarks(chief: tuple[int, ...]) -> str:
     if len(chief) > MOST:
         text += f" and {len(chief) - MOST} more"
     return text
+
+
+def fault_sentence(v: Findings, s: Scale) -> str:
+    """The sentence where a question found a fault."""
+    faults = set(v.faults)
+    of_scale = faults.intersection(SCALE)
+    of_bias = faults.intersection(BIAS)
+    is_asked = any(answer.question in BIAS for answer in v.answers)
+    found: list[tuple[str, Collection[str]]] = []  # sentences, with the questions that they answer
+    contrary = v.status == "inconsistent" and smaller(v.faults, s) and JOINT not in v.faults
+    if v.status == "heavy-tailed" or "outliers" in v.faults or (contrary and not opposite(v)):
+        found.append((tails_text(v), ["outliers"]))
+    if of_bias:
+        found.append((bias_text(v, "bias" not in v.faults), BIAS))
+    scale = ""
+    if of_scale and v.status not in ("biased", "heavy-tailed"):
+        scale = scale_text(v)
+        found.append((scale, SCALE))
+    if faults.intersection(SHAPE) and v.status not in ("biased", "heavy-tailed"):
+        found.append((shape_text(v, scale), SHAPE))
+    if JOINT in v.faults and v.joint is not None and v.status != "heavy-tailed":
+        found.append((joint_text(v, v.joint), [JOINT]))
+    found.sort(key=lambda one: _rank(v, one[1]))
+    parts = [text for text, _ in found]
+    if v.status == "heavy-tailed":
+        parts.append(f"in the mean the covariance ratio is {ratio_text(s.inflation)}")
+    if v.by_group is not None:
+        parts.append(groups_text(v.by_group, GROUP in v.faults))
+    if len(v.faults) == 1:
+        parts += [ALONE[question] for question in v.faults if question in ALONE]
+    if v.innovations is not None:
+        parts += innovation_faults(v, v.innovations)
+    if (of_scale or GROUP in v.faults) and not of_bias and v.status != "heavy-tailed" and is_asked:
+        parts.append("no bias found")
+    return "; ".join(part for part in parts if part)
+
+
+def _rank(v: Findings, questions: Collection[str]) -> tuple[bool, float, int]:
+    """Order of a fault in the sentence: what the status says, then by p value, the size before what else is wrong."""
+    p = min((a.adjusted for a in v.answers if a.question in questions and a.question in v.faults), default=1.0)
+    order = (SCALE, BIAS, SHAPE)
+    return questions != CHIEF_QUESTIONS.get(v.status), max(p, SMALLEST_P), [*order, questions].index(questions)
+
+
+def ratios_of_blocks(axes: ComponentRatios) -> dict[str, Interval]:
+    """Ratio of each block whose axes are alike, and of every other axis by itself."""
+    ratios, inside = {}, set()
+    for block in BLOCKS:
+        members = members_of(axes, block)
+        if members and are_alike([axes.inflation[name] for name in (block, *members)]):
+            ratios[block] = axes.inflation[block]
+            inside.update(members)
+    return ratios | {axis: axes.inflation[axis] for axis in axes.names if axis not in inside}
+
+
+def members_of(axes: ComponentRatios, block: str) -> list[str]:
+    """Axes of a block of several; none where the state has no such block."""
+    index = axes.groups.get(block, ())
+    if block not in BLOCKS or len(index) < 2:
+        return []
+    return [axes.names[i] for i in index]
+
+
+def are_alike(intervals: list[Interval]) -> bool:
+    """Whether some factor lies in all of the intervals."""
+    return max(interval.low for interval in intervals) <= min(interval.high for interval in intervals)
+
+
+def is_right(v: Findings, name: str, ratio: Interval) -> bool:
+    """Whether an axis or block is shown to lie within ``--detect``, and each of its axes may be right and is near 1."""
+    assert v.axes is not None
+    ratios = [v.axes.inflation[each] for each in (name, *members_of(v.axes, name))]
+    are_near = all(each.holds(1.0) and 1.0 / NEAR <= each.value <= NEAR for each in ratios)
+    return are_near and 1.0 / v.settings.factor <= ratio.low and ratio.high <= v.settings.factor
+
+
+def unlike_ratios(v: Findings) -> dict[str, Interval]:
+    """Blocks and axes whose ratio is not 1, the farthest first; none where all may be off by one factor.
+
+    Of a conservative covariance those that are too large alone, as nothing in it has to grow. Where that is not a
+    fault, those that are too small.
+    """
+    if v.axes is None:
+        return {}
+    ratios = ratios_of_blocks(v.axes)
+    if are_alike(list(ratios.values())):
+        return {}
+    off = []
+    if not v.settings.one_sided:
+        off = [(name, ratio) for name, ratio in ratios.items() if ratio.high < 1.0]
+    if v.status != "conservative":
+        off += [(name, ratio) for name, ratio in ratios.items() if ratio.low > 1.0]
+    return dict(sorted(off, key=lambda item: -abs(np.log(max(item[1].value, TINY)))))
+
+
+def unlike_text(v: Findings) -> str:
+    """Position too small by x2.22 [1.80, 2.81], attitude and velocity right; '' where factors may be the same."""
+    off = unlike_ratios(v)
+    if not off:
+        return ""
+    assert v.axes is not None
+    texts = []
+    side = ""
+    for name in names_to_say(off):
+        size = off_by(off[name])
+        texts.append(f"{name} {size.removeprefix(side).lstrip()}")  # the side once: x too small by ..., y by ...
+        side = size[:SIDE]
+    others = {name: ratio for name, ratio in ratios_of_blocks(v.axes).items() if name not in off}
+    right = [name for name, ratio in others.items() if is_right(v, name, ratio)]
+    if len(right) > MOST and len(right) == len(others):
+        texts.append("the others right")
+    elif 1 <= len(right) <= MOST:
+        texts.append(f"{names_in_a_row(right)} right")
+    return ", ".join(texts)
+
+
+def names_to_say(off: dict[str, Interval]) -> list[str]:
+    """The first of those that are off, with one of either side."""
+    names = list(off)[:MOST]
+    contrary = [name for name in off if (off[name].value > 1.0) != (off[names[0]].value > 1.0)]
+    if contrary and contrary[0] not in names:
+        names[-1] = contrary[0]
+    return names
+
+
+def factors_text(v: Findings) -> str:
+    """:func:`unlike_text` where the axes that carry the fault of the scale are among those that it names, or ''."""
+    assert v.location is not None
+    if v.axes is None:
+        return ""
+    inside = set()
+    for name in unlike_ratios(v):
+        inside.update(members_of(v.axes, name) or [name])
+    if not inside.issuperset(v.location.subset.split(", ") if v.location.subset else ()):
+        return ""
+    return unlike_text(v)
+
+
+def level_causes(found: Findings) -> list[str]:
+    """Usual levels whose factor the interval of the ratio holds, if it is narrow and all components agree; or none.
+
+    Other faults make such a ratio, too: about one in 20 of the filters whose covariance is too large by any factor.
+    """
+    if found.status != "conservative" or found.scale is None:
+        return []
+    ratio = found.scale.inflation
+    if not 0.0 < ratio.high <= NARROW * ratio.low:
+        return []
+    ratios = [ratio]
+    if found.axes is not None:
+        ratios += [found.axes.inflation[name] for name in found.axes.names]
+    fitting = [of for of in LEVELS if all(each.holds(1.0 / of) for each in ratios)]
+    if found.scale.dof != 2:
+        fitting = [of for of in fitting if of != CEP]
+    if not fitting:
+        return []
+    words = " or ".join(LEVELS[of] for of in fitting)
+    factors = " or ".join(f"{of:g}" for of in fitting)
+    return [f"perhaps a matter of what is stated: a covariance that is {factors} times too large would fit {words}"]
+
+
+def groups_text(by: ByGroup, is_fault: bool) -> str:
+    """The worst group where one is at fault, otherwise what is shown of the groups."""
+    if is_fault:
+        return _faults(by)
+    return _without_fault(by)
+
+
+def right_groups(v: Findings) -> str:
+    """What is shown of the groups of the whole, or of each part, where none is at fault."""
+    if v.by_group is not None:
+        return f"; {_without_fault(v.by_group)}"
+    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
+    return "".join(texts)
+
+
+def _faults(by: ByGroup) -> str:
+    """The worst group and those beside it, then where the covariance is shown to be right."""
+    worst = by.worst
+    others = [group for group in by.groups if group.status in SIDES and group is not worst]
+    text = f"covariance {off_by(worst.ratio)} where {worst.name}"
+    if len(others) == 1:
+        text += f", and {off_by(others[0].ratio)} where {others[0].name}"
+    elif others:
+        which = f"{len(others)} of the {len(by.groups) - 1} other groups"
+        if len(others) == len(by.groups) - 1:
+            which = f"all {len(others)} other groups"
+        text += f", and wrong in {which} by {by.column}"
+    right = _consistent(by)
+    if right:
+        text += f"; consistent where {right}"
+    return text
+
+
+def _without_fault(by: ByGroup) -> str:
+    """What is shown of the groups where none is at fault, and the one that is farthest."""
+    worst = by.worst
+    count = len(by.groups)
+    if not worst.status:
+        return f"groups by {by.column} are reported and not judged"
+    right = sum(group.status == "consistent" for group in by.groups)
+    if right == count:
+        return f"consistent in each of {count} groups by {by.column}"
+    return f"consistent in {right} of {count} groups by {by.column} (farthest {ratio_text(worst.ratio)}, {worst.name})"
+
+
+def lines_of_groups(by: ByGroup, unit: str) -> list[str]:
+    """A line for each group, then what its values leave to be said."""
+    lines = []
+    if by.outcome:
+        lines.append(f"{by.column} {by.outcome}, which selects on the outcome: groups show, they do not convict")
+    lines += [f"{group.name}: {_figures(group, unit)}" for group in by.groups]
+    if by.without:
+        lines.append(f"{plural(by.without, 'step')} without a value of {by.column} {is_or_are(by.without)} in no group")
+    return lines
+
+
+def _figures(group: Group, unit: str) -> str:
+    """Ratio, verdict and size of a group."""
+    text = f"covariance ratio {ratio_text(group.ratio)}"
+    if group.status:
+        text += f", {group.status}"
+    if group.status in SIDES:
+        text += f" (p {p_text(group.p_value)})"
+    text += f", in {plural(group.steps, 'step')} of {plural(group.runs, unit)}"
+    if group.status == "undecided":
+        text += _advice(group, unit)
+    return text
+
+
+def _advice(group: Group, unit: str) -> str:
+    """That a group is in too few runs, and how many would decide."""
+    few = ""
+    if group.runs < FEW:
+        few = f", too few to see how steps depend on each other ({FEW} are needed)"
+    runs = group.equivalence.runs
+    if runs is None or runs > MUCH:
+        return few
+    return f"{few}; {max(runs, group.runs + 1)} such {unit}s would probably decide"
+
+
+def _consistent(by: ByGroup) -> str:
+    """The groups where the covariance is shown to be right; neighbouring groups of numbers as one range."""
+    names: list[str] = []
+    low = high = np.nan
+    for group in by.groups:
+        if group.status != "consistent":
+            continue
+        if group.span is None:
+            names.append(group.name)
+        elif group.span[0] == high:
+            high = group.span[1]
+            names[-1] = range_name(by.column, low, high)
+        else:
+            low, high = group.span
+            names.append(group.name)
+    if len(names) > MOST:
+        names = [*names[:MOST], f"in {len(names) - MOST} other groups"]
+    return " or ".join(names)

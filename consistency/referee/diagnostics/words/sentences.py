@@ -1,4 +1,4 @@
-"""A verdict in words: a sentence to act on, then the figures behind it."""
+"""A verdict in words: a sentence to act on, then the figures behind it. How a single fault is said is in ``faults``."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.diagnostics.judging.status import clear
-from consistency.referee.diagnostics.questions.sample import ATTITUDE
+from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.coverage_and_rmse import TWO_SIGMA
+from consistency.referee.diagnostics.statistics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
-from consistency.referee.diagnostics.verdict.answers import SCALE, Settings
 from consistency.referee.diagnostics.verdict.parts import (
+    SCALE,
     ByGroup,
     Equivalence,
     Innovations,
     Interval,
     Location,
     Scale,
+    Settings,
     Within,
 )
 from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, ConventionResult, Findings, Verdict
@@ -38,6 +39,10 @@ from consistency.referee.diagnostics.words.numbers import (
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
 MUCH = 100_000  # runs; more are not advice
 MOST_STEPS = 10_000_000  # of a log; more are not advice
+FEWEST = 8  # runs; fewer true starts may be near each other by chance
+SAME = 0.1  # of the stated variance of the position, which that of true starts drawn from it exceeds
+LESS = 0.5  # of the median of all steps, that the NEES of the first one is at most
+ROUNDING = 1e-9  # of the extent of a path
 
 
 def reasons(v: Findings) -> list[str]:
@@ -101,7 +106,7 @@ def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
         if v.faults and v.parts:
             return _faults_of_parts(v), figures
         if v.faults:
-            from consistency.referee.diagnostics.words.fault_sentence import fault_sentence
+            from consistency.referee.diagnostics.words.faults import fault_sentence
 
             return fault_sentence(v, v.scale), figures
         return _no_fault(v, v.scale), figures
@@ -203,7 +208,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
     if v.by_group is not None or v.parts:
-        from consistency.referee.diagnostics.words.groups import right_groups
+        from consistency.referee.diagnostics.words.faults import right_groups
 
         axis += right_groups(v)
     if shown.shown:
@@ -355,7 +360,7 @@ def _two_intervals(s: Scale) -> list[str]:
 def _groups(by: ByGroup | None, unit: str) -> list[str]:
     if by is None:
         return []
-    from consistency.referee.diagnostics.words.groups import lines_of_groups
+    from consistency.referee.diagnostics.words.faults import lines_of_groups
 
     return lines_of_groups(by, unit)
 
@@ -544,3 +549,35 @@ def sentences_of_conventions(
     for kind, verdict in verdicts.items():
         lines.append(f"if the error is {kind}: {verdict.reasons[0]}")
     return lines
+
+
+def same_truth(record: Record, found: Findings) -> list[str]:
+    """That all runs have the same true path or start, where the covariance is too large in the first judged step.
+
+    There it has to be worse than in most: a covariance that is too large throughout is so for another reason.
+    """
+    where = found.location
+    if record.path is None or where is None or where.first_outside is None or len(record.path) < FEWEST:
+        return []
+    assert record.nees is not None
+    assert found.scale is not None
+    step = int(np.argmax(found.scale.alive > 0))
+    anees = found.scale.anees
+    is_below = bool(anees[step] < min(where.simultaneous[step, 0], LESS * float(np.nanmedian(anees))))
+    if not is_below or not set(found.faults) & set(SCALE):
+        return []
+    true = record.path[:, :, 0]
+    apart = np.abs(true - true[:1])
+    if np.nanmax(apart) <= ROUNDING * max(float(np.nanmax(np.abs(true))), 1.0):
+        return [
+            "all runs have the same true path: draw its start from the first covariance, which allows for others, and "
+            "the rest from the filter's model"
+        ]
+    counted = np.isfinite(record.nees[:, step])
+    index = [i for i, axis in enumerate(record.axes) if axis in POSITION]
+    stated = np.asarray(record.covariance)[counted, step][:, index, index].mean(axis=0).sum()
+    if np.nanvar(true[counted, step], axis=0).sum() < SAME * stated:
+        return [
+            "all runs have the same true start, which the covariance does not know: draw it from the first covariance"
+        ]
+    return []

@@ -1,17 +1,29 @@
-"""What a file of estimates is, by its name and its first lines."""
+"""What a file of estimates is, by its name and its first lines: names of columns, and the first row of numbers."""
 
 from __future__ import annotations
 
+import csv
 import re
+import zlib
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.columns import pose_columns, rates_in, state_columns
-from consistency.referee.readers.formats.file_head import beginning, begins_with_numbers, head_of
-from consistency.referee.readers.formats.spellings import PLAIN, Columns, clock_of
+from consistency.referee.parsing import is_file
+from consistency.referee.readers.formats.columns import (
+    PLAIN,
+    Columns,
+    clock_of,
+    pose_columns,
+    rates_in,
+    renamed,
+    state_columns,
+)
+from consistency.referee.readers.formats.text_blocks import opened
 from consistency.referee.readers.options import Reading
 
 TABLES = (".csv", ".parquet", ".pq", ".jsonl", ".ndjson")
@@ -20,6 +32,24 @@ TRAJECTORIES = (".txt", ".tum")
 BAGS = (".bag", ".mcap", ".db3")
 PARTNERS = (*sorted(TRAJECTORIES), ".csv", ".pos", *TABLES)  # of a file of the same stem, the first that is there
 HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
+SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
+ARRAYS = "errors=truth - estimates, covariances=P"
+LOG, PACKED = "flight logs are for 'consistency monitor'", "unpack it"
+TEXT = "rename text to .csv, or to .txt if its columns have no names"
+HDF5, LOADED = "h5py.File(name)[key][()] is an array of it", "load it"
+SHEET = "save the sheet as .csv"
+WAYS_IN = {
+    ".ulg": LOG, ".bin": LOG, ".gz": PACKED, ".zip": PACKED, ".7z": PACKED, ".xz": PACKED, ".bz2": PACKED,
+    ".zst": PACKED, ".dat": TEXT, ".log": TEXT, ".out": TEXT, "": TEXT, ".h5": HDF5, ".hdf5": HDF5, ".npy": LOADED,
+    ".pkl": LOADED, ".pickle": LOADED, ".xls": SHEET, ".xlsx": SHEET, ".ods": SHEET,
+    ".json": "a file with an object a line is .jsonl",
+}  # for files of unknown kinds, by suffix  # fmt: skip
+FOREIGN = {
+    rb"(?m)^CCSDS_OEM_VERS": "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km",
+    rb"(?m)^(# )?(Raw|Fix),": "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data",
+    rb"(?m)^\$G[A-Z]{4},": "a log of NMEA, which has deviations in its GST sentences alone",
+}
+PEEKED = 2**16  # bytes of a file that hold its header and its first row
 
 
 def is_bag(path: Path) -> bool:
@@ -140,25 +170,6 @@ def fitted_note(path: Path) -> str:
     return ""
 
 
-SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
-ARRAYS = "errors=truth - estimates, covariances=P"
-LOG, PACKED = "flight logs are for 'consistency monitor'", "unpack it"
-TEXT = "rename text to .csv, or to .txt if its columns have no names"
-HDF5, LOADED = "h5py.File(name)[key][()] is an array of it", "load it"
-SHEET = "save the sheet as .csv"
-WAYS_IN = {
-    ".ulg": LOG, ".bin": LOG, ".gz": PACKED, ".zip": PACKED, ".7z": PACKED, ".xz": PACKED, ".bz2": PACKED,
-    ".zst": PACKED, ".dat": TEXT, ".log": TEXT, ".out": TEXT, "": TEXT, ".h5": HDF5, ".hdf5": HDF5, ".npy": LOADED,
-    ".pkl": LOADED, ".pickle": LOADED, ".xls": SHEET, ".xlsx": SHEET, ".ods": SHEET,
-    ".json": "a file with an object a line is .jsonl",
-}  # for files of unknown kinds, by suffix  # fmt: skip
-FOREIGN = {
-    rb"(?m)^CCSDS_OEM_VERS": "an orbit of CCSDS, whose covariances are of the axes COV_REF_FRAME, in km",
-    rb"(?m)^(# )?(Raw|Fix),": "a log of Android, whose accuracies are radii of 68 %; RTKLIB solves its raw data",
-    rb"(?m)^\$G[A-Z]{4},": "a log of NMEA, which has deviations in its GST sentences alone",
-}
-
-
 def is_foreign(path: Path) -> str:
     """What a text file of another format is, and how it gets here; "" of all else."""
     if path.suffix.lower() in (*ARCHIVES, *BAGS):
@@ -176,3 +187,102 @@ def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRA
     line = f"in Python, numpy.savez('{path.stem}.npz', {arrays}) makes an archive of arrays (runs, steps, ...)"
     kinds = f"{path}: unknown kind of file; known are {', '.join(known)} (.txt and .tum are TUM trajectories)"
     return InputError("; ".join(filter(None, (kinds, line, hint))))
+
+
+class Head(NamedTuple):
+    """Names of the columns of a text file, as they stand in it."""
+
+    names: list[str]
+    line: int  # of the names, from 1
+    comment: bool  # it begins with #
+    spaced: bool  # by white space
+    places: Sequence[int]  # of these columns in the file
+
+
+def head_of(path: Path, columns: Columns | None = None) -> Head | None:
+    """The names of columns above the first row of numbers, those of ``columns`` in place of the file's own.
+
+    None where the file has none.
+    """
+    lines, row = _beginning(path)
+    if row is None or not lines:
+        return None
+    number, line = lines[-1]
+    comment = _is_comment(line)
+    if not comment and sum(not _is_comment(text) for _, text in lines) > 1:
+        return None
+    names = fields_of(line)
+    width = len(fields_of(row))
+    if comment:
+        text = line.strip().lstrip("#")
+        names = fields_of(text)
+        if len(names) != width:
+            names = re.split(r"\s{2,}", text.strip())
+    if len(names) != width:
+        return None
+    is_spaced = not any(mark in line for mark in ",;\t")
+    known, places = zip(*renamed(names, columns, path), strict=True)
+    return Head(list(known), number, comment, is_spaced, places)
+
+
+def begins_with_numbers(path: Path) -> bool:
+    """Whether the first line that is not a comment is of numbers alone."""
+    lines, row = _beginning(path)
+    if row is None or not all(_is_comment(text) for _, text in lines):
+        return False
+    return all(map(_is_number, fields_of(row)))
+
+
+def beginning(path: Path) -> bytes:
+    """The first bytes of a file; none of what is not a file or cannot be read."""
+    if not is_file(path):  # a pipe would be waited for
+        return b""
+    try:
+        with opened(path) as file:
+            return file.read(PEEKED)
+    except (OSError, EOFError, zlib.error):
+        return b""
+
+
+def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
+    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    text = beginning(path).decode("utf-8-sig", "ignore")
+    lines: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        if _is_row(line):
+            return lines, line
+        lines.append((number, line))
+    return lines, None
+
+
+def _is_row(line: str) -> bool:
+    """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
+    fields = fields_of(line)
+    numbers = sum(map(_is_number, fields))
+    return not _is_comment(line) and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def fields_of(line: str) -> list[str]:
+    """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
+    separator = max(",;\t", key=line.count)
+    fields = line.split()
+    if separator in line:
+        fields = line.split(separator)
+    if '"' in line and separator in line:
+        with suppress(csv.Error):  # of a line with a null character
+            return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [field.strip().strip('"') for field in fields]

@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import MOST_DOF, require_name
-from consistency.referee.readers.formats.archive_arrays import Archive, load_arrays
+from consistency.referee.readers.formats.archives import Archive, load_arrays
 from consistency.referee.readers.formats.file_kinds import ARCHIVES, TABLES, unknown_kind
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, CsvTable, TableRows, checked_dof, read_sheet
 from consistency.referee.readers.formats.table_columns import row_order, with_clock, with_nis
@@ -157,7 +157,7 @@ def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
     keys = ("innovations", "innovation_covariances")
     if "nis" in arrays or not set(keys) <= set(arrays):
         return arrays
-    from consistency.referee.diagnostics.questions.innovations import nis_of
+    from consistency.referee.diagnostics.questions.whiteness import nis_of
 
     v, S = (arrays[key] for key in keys)
     are_numbers = v.dtype.kind in "fiu" and S.dtype.kind in "fiu"

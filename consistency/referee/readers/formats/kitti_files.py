@@ -13,10 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.lie_groups import inverse, vectors
+from consistency.referee.geometry import inverse, vectors
 from consistency.referee.parsing import HUGE, one_line, read_text, reading
-from consistency.referee.readers.formats.pose_rows import on_plane
-from consistency.referee.readers.formats.rotations import are_rotations
+from consistency.referee.readers.formats.pose_rows import are_rotations, on_plane
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.types import Array

@@ -1,5 +1,7 @@
 """Poses in space as rows ``t x y z qx qy qz qw`` with a covariance, from every layout of text that they come in.
 
+Rotations are checked. Planar poses may be made of them, or of speeds and turn rates.
+
 The layout is told by the names of the columns, or by their number and what they hold.
 """
 
@@ -12,20 +14,34 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.records.large_arrays import diagonal
+from consistency.referee.column_names import POSE
+from consistency.referee.diagnostics.records.whitening import diagonal
 from consistency.referee.errors import InputError
-from consistency.referee.readers.clock_units import UNIT_NAMES
-from consistency.referee.readers.formats.columns import PoseColumns, pose_columns, true_pose_columns
-from consistency.referee.readers.formats.file_head import Head, head_of
-from consistency.referee.readers.formats.file_kinds import is_solution
-from consistency.referee.readers.formats.geodetic import read_solution
-from consistency.referee.readers.formats.rotations import TOLERANCE, are_rotations, quaternions
+from consistency.referee.geometry import INERTIAL, SPATIAL, wrap
+from consistency.referee.readers.clocks import UNIT_NAMES, nothing_near
+from consistency.referee.readers.formats.columns import (
+    PLAIN,
+    Clock,
+    Columns,
+    PoseColumns,
+    clock_of,
+    is_numbered,
+    naming,
+    pose_columns,
+    rates_in,
+    require_units,
+    state_columns,
+    true_pose_columns,
+)
+from consistency.referee.readers.formats.file_kinds import Head, head_of, is_poses, is_solution
+from consistency.referee.readers.formats.positions import read_solution
 from consistency.referee.readers.formats.sheet import OF_ONE_RUN, TableRows, sheet_of
-from consistency.referee.readers.formats.spellings import Clock, Columns, clock_of, naming, require_units
 from consistency.referee.readers.formats.table_columns import times_of
 from consistency.referee.readers.formats.text_blocks import Lines, increasing, read_numbers, read_rows
+from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import refuse
-from consistency.referee.readers.truth_matching import finite_rows
+from consistency.referee.readers.runs_to_record import symmetric
+from consistency.referee.readers.truth_matching import associate, finite_rows
 from consistency.referee.types import Array, Indices
 
 POSE_NUMBERS = 8  # columns of a pose
@@ -42,6 +58,23 @@ STATED = (0, TRIANGLE, FULL)  # columns of a covariance behind a matrix
 MATRIX_WIDTHS = {matrix + stated: (first, matrix) for matrix, first in MATRICES.items() for stated in STATED}
 LAYOUT = f"t tx ty tz qx qy qz qw ({', '.join(map(str, TUM))} columns)"
 AS_ESTIMATED = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
+# --- states of a simulation with OpenVINS ------------------------------------------------------------
+
+CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
+LARGEST = 200  # columns, of more cameras than OpenVINS takes
+STATES = range(CAMERAS + 1 + CALIBRATION, LARGEST)  # columns of a state
+DEVIATION_WIDTHS = range(CAMERAS + CALIBRATION - 1, LARGEST)  # of its deviations: a rotation has three, not four
+AS_TUM = [0, 5, 6, 7, 1, 2, 3, 4]  # t, position and quaternion in the order of TUM
+REST = slice(8, 17)  # velocity, biases
+SIGMA = [4, 5, 6, 1, 2, 3, *range(7, 16)]  # position, rotation, velocity, biases
+DEVIATIONS_LAYOUT = (
+    "t, three standard deviations of the rotation, rad, three of the position, m, and those of the rest of the state"
+)
+ORDERS = ("translation-rotation", "rotation-translation")
+BLOCKS = ("p", "R", "v", "bg", "ba")  # three components each, in the order of a state
+BOTH = 2 * FULL  # and a cross-covariance with the line before
+TOLERANCE = 1e-3  # largest entry of R R' - I
+UNIT = 1e-3  # of the length of a quaternion: four decimals pass
 
 
 def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -> Lines:
@@ -239,20 +272,6 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     return t, f"times from {times.name} beside them"
 
 
-# --- states of a simulation with OpenVINS ------------------------------------------------------------
-
-CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
-LARGEST = 200  # columns, of more cameras than OpenVINS takes
-STATES = range(CAMERAS + 1 + CALIBRATION, LARGEST)  # columns of a state
-DEVIATION_WIDTHS = range(CAMERAS + CALIBRATION - 1, LARGEST)  # of its deviations: a rotation has three, not four
-AS_TUM = [0, 5, 6, 7, 1, 2, 3, 4]  # t, position and quaternion in the order of TUM
-REST = slice(8, 17)  # velocity, biases
-SIGMA = [4, 5, 6, 1, 2, 3, *range(7, 16)]  # position, rotation, velocity, biases
-DEVIATIONS_LAYOUT = (
-    "t, three standard deviations of the rotation, rad, three of the position, m, and those of the rest of the state"
-)
-
-
 class States(Lines):
     """Poses (N, 8) as in a TUM trajectory, of a simulation with OpenVINS: states, and a file of their deviations."""
 
@@ -291,3 +310,243 @@ def _has_cameras(values: Array, column: int, each: int) -> bool:
     width = column + 1 + each * cameras
     are_numbers = (cameras >= 1) & (cameras == np.round(cameras))
     return bool((are_numbers & (width <= values.shape[1])).all())
+
+
+def components_in(numbers: int) -> int | None:
+    """Components of a covariance of which a row holds n^2 numbers, the upper triangle, or n deviations."""
+    return next((n for n in DEVIATIONS if numbers in (n, n * n, n * (n + 1) // 2)), None)
+
+
+def components_of(lines: Lines) -> int:
+    """Components whose covariance or deviations stand behind the poses; those of a pose where none do."""
+    return components_in(lines.values.shape[1] - POSE_NUMBERS) or 6
+
+
+def covariances_in(lines: Lines, order: str) -> Array | None:
+    """Covariances (N, n, n), translation first, that stand behind the poses; None without any."""
+    numbers = lines.values[:, POSE_NUMBERS:]
+    if not numbers.shape[1]:
+        return None
+    if lines.values.shape[1] != SPLIT:
+        return _matrices(numbers, order)
+    out = np.zeros((len(numbers), 6, 6))  # two triangles: rotation, then position
+    out[:, 3:, 3:] = _from_triangle(numbers[:, :6], 3)
+    out[:, :3, :3] = _from_triangle(numbers[:, 6:], 3)
+    return out
+
+
+def matrices_of(source: Lines, order: str) -> Array:
+    """Covariances (N, 6, 6), translation first, of the lines of a file of covariances."""
+    return _matrices(source.values[:, 1 : 1 + FULL], order)
+
+
+def _matrices(numbers: Array, order: str) -> Array:
+    """Covariances (N, n, n), translation first, of numbers in the order of a file."""
+    many = numbers.shape[1]
+    n = components_in(many)
+    assert n is not None
+    places = covariance_order(n, order)
+    if many == n:
+        return diagonal(numbers[:, places])
+    P = numbers.reshape(-1, n, n) if many == n * n else _from_triangle(numbers, n)
+    if order == ORDERS[0]:
+        return P
+    return np.asarray(P[:, places][:, :, places])
+
+
+def _from_triangle(numbers: Array, n: int) -> Array:
+    out = np.empty((len(numbers), n, n))
+    i, j = np.triu_indices(n)
+    out[:, i, j] = out[:, j, i] = numbers
+    return out
+
+
+# --- the order of blocks -----------------------------------------------------------------------------
+
+
+def covariance_order(n: int, order: str) -> list[int]:
+    """Places of x, y, z, the rotation and n - 6 more among components in an order."""
+    there = BLOCKS[: n // 3]
+    blocks = [block for block in blocks_in(n, order) if block in there]
+    return [3 * blocks.index(block) + i for block in there for i in range(3)]
+
+
+def blocks_in(n: int, order: str) -> list[str]:
+    """Blocks of a covariance (n, n) in an order, which may leave out the last ones."""
+    names = {ORDERS[0]: "p,R", ORDERS[1]: "R,p"}.get(order, order).split(",")
+    return [*names, *(block for block in BLOCKS[: n // 3] if block not in names)]
+
+
+def order_note(path: Path | str, n: int, r: Reading) -> str:
+    """The order of the blocks: where it is declared, or where no names of columns tell that of three or more.
+
+    Raises
+    ------
+    InputError
+        The declared order does not go with n components.
+    """
+    order = r.covariance_order
+    blocks = blocks_in(n, order or ORDERS[0])
+    there = BLOCKS[: n // 3]
+    if sorted(blocks) != sorted(there):
+        which = f"the blocks {','.join(there)} of {path} in their order, such as {','.join(reversed(there))}"
+        names = "(p position, R rotation, v velocity, bg, ba biases)"
+        raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which} {names}")
+    if order is None:
+        head = None if n == 6 else head_of(Path(path), r.columns)
+        if n == 6 or (head is not None and not any(map(is_numbered, head.names))):
+            return ""
+    return f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"
+
+
+def require_error(own: Lines, error: str | None) -> None:
+    """Refuse covariances of states whose error is not declared, and an error of states for poses alone."""
+    n = components_of(own)
+    if n > 6 and error is None:
+        what = f"{own.path}: holds a covariance of poses with their velocity, whose error is not known"
+        raise InputError(f"{what}; add --error {', '.join(INERTIAL)} ('guess' is for poses alone)")
+    if n == 6:
+        require_spatial(error, SPATIAL)
+
+
+def require_spatial(error: str | None, known: dict[str, str]) -> None:
+    """Refuse an error that poses in space do not have."""
+    if error not in (None, *known):
+        raise InputError(f"--error {error}: for a trajectory in space it is one of {', '.join(SPATIAL)}")
+
+
+# --- files of their own ------------------------------------------------------------------------------
+
+
+def read_covariances(path: Path) -> Lines:
+    """A file of covariances: t, then 36 numbers row by row, or the 21 of the upper triangle.
+
+    72 numbers are the 36 and the cross-covariance E e_before e' with the line before, row by row.
+    """
+    layout = f"t and {FULL} numbers, or t and {TRIANGLE}, or t and {BOTH}"
+    return read_numbers(path, (1 + TRIANGLE, 1 + FULL, 1 + BOTH), layout)
+
+
+def nearest_rows(own: Lines, other: Lines, tolerance: float) -> tuple[Indices, Indices]:
+    """Rows (k,) of some lines, and those of a file of covariances that are near in time."""
+    rows, match = associate(own.t, other.t, tolerance)
+    if not len(rows):
+        raise nothing_near((own.path, other.path), own.t, other.t, tolerance, "estimate", "covariance")
+    return rows, match
+
+
+def from_file(lines: Lines, path: Path, order: str, tolerance: float) -> Array:
+    """Covariances (N, 6, 6) of lines from a file of their own; NaN where it has none near in time."""
+    source = read_covariances(path)
+    rows, picked = nearest_rows(lines, source, tolerance)
+    return on_rows(len(lines.t), rows, matrices_of(source, order)[picked], source, picked)
+
+
+def on_rows(count: int, rows: Indices, P: Array, source: Lines, picked: Indices) -> Array:
+    """Covariances (count, n, n) with ``P`` (k, n, n) in some rows, symmetric, and NaN in the others."""
+    out = np.full((count, *P.shape[1:]), np.nan)
+    out[rows] = symmetric(P, lambda row: source.place(int(picked[row])), one_triangle=True)
+    return out
+
+
+def cross_covariances(own: Lines, source: Lines, rows: Indices, picked: Indices, order: str) -> Array:
+    """Cross-covariances with the line before, on the rows of ``own``, (N, 6, 6)."""
+    what = "but the cross-covariance of the next line is with this one; give each line its pose"
+    gap = np.diff(picked) != 1
+    refuse(gap, lambda row: source.place(int(picked[row]) + 1), f"no pose of {own.path} has this time, {what}")
+    out = np.full((len(own.t), 6, 6), np.nan)
+    out[rows] = _matrices(source.values[picked, 1 + FULL :], order)
+    return out
+
+
+def are_rotations(R: Array) -> Indices:
+    """Whether matrices (..., 3, 3) are rotations, (...) of bool; no matrix that is not finite is."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        product = R @ np.swapaxes(R, -1, -2)
+        off = np.abs(product - np.eye(3)).max(axis=(-2, -1))
+        return np.asarray((off < TOLERANCE) & (np.linalg.det(R) > 0))
+
+
+def quaternions(R: Array) -> Array:
+    """Quaternions x, y, z, w (..., 4) of rotations (..., 3, 3); NaN where these are not finite."""
+    matrices = R.reshape(-1, 3, 3)
+    out = np.full((len(matrices), 4), np.nan)
+    finite = finite_rows(matrices)
+    if finite.any():  # older SciPy makes no empty rotations
+        out[finite] = Rotation.from_matrix(matrices[finite]).as_quat()
+    return out.reshape(*R.shape[:-2], 4)
+
+
+def not_unit(pose: Array) -> tuple[Indices, Array]:
+    """Which finite poses x, y, z, qx, qy, qz, qw (N, 7) have quaternions of another length than 1; all lengths (N,)."""
+    length = np.linalg.norm(pose[:, 3:], axis=1)
+    bad = finite_rows(pose) & (np.abs(length - 1.0) > UNIT)
+    return np.asarray(bad), length
+
+
+def read_plane(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
+    """A table with planar poses t, x, y, heading of a file that holds them otherwise, and what it was read as.
+
+    Speeds and turn rates are integrated, each held from its row to the next: to the motion since the row before, in
+    the frame of the body there, with ``motions``; else to poses from (0, 0, 0) on. Of poses in space it is the
+    position and the heading of the x axis.
+
+    Raises
+    ------
+    InputError
+        Speeds are of several runs, or a row cannot be read.
+    """
+    if is_poses(path, columns):
+        lines = read_poses(path, true=True, columns=columns)
+        of = lines.note or f"{path}: read as poses in space"
+        return on_plane(lines, "line"), f"{of}, of which the heading is that of the x axis"
+    head = head_of(path, columns)
+    assert head is not None
+    names = head.names
+    clock = clock_of(names)
+    assert clock is not None
+    poses = state_columns(names, POSE, PLAIN)
+    are_poses = len(poses) == len(POSE)
+    moving = tuple(poses.values()) if are_poses else rates_in(names)
+    require_units([names[place] for place in (*clock.places, *moving)], path)
+    sheet = sheet_of(path, head, columns)
+    t, unit = times_of(sheet, clock, [sheet.numbers(names[place]) for place in clock.places])
+    pose = sheet.matrix(names[place] for place in moving)
+    of = "planar poses"
+    if not are_poses:
+        if "run" in sheet or "filter" in sheet:
+            raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
+        what = "motions" if motions else "poses"
+        of = f"speed and turn rate, each held until the next, integrated to {what}"
+        pose = motions_of(t, *pose.T)
+        if not motions:
+            pose = poses_of(pose)
+    data = dict(zip(["t", *POSE], [t, *pose.T], strict=True))
+    note = f"{path}: read as {of}, {len(names)} columns, {UNIT_NAMES[unit]}"
+    return replace(sheet, data=sheet.data | data), note
+
+
+def motions_of(t: Array, v: Array, omega: Array) -> Array:
+    """Motions (N, 3) since the row before: forward, left and turn, in the frame of the body there, m and rad.
+
+    Arcs of circles: ``v`` and ``omega`` (N,), m/s and rad/s, hold from their time ``t``, s, to the next one. The first
+    row is 0.
+    """
+    dt = np.diff(t)
+    turn = omega[:-1] * dt
+    way = v[:-1] * dt
+    half = 0.5 * turn
+    chord = way * np.sinc(half / np.pi)
+    rows = np.column_stack([chord * np.cos(half), chord * np.sin(half), turn])
+    return np.concatenate([np.zeros((1, 3)), rows])
+
+
+def poses_of(motions: Array) -> Array:
+    """Poses (N, 3) from (0, 0, 0) on, of motions as :func:`motions_of` gives them; headings within half a turn."""
+    forward, left, turn = motions.T
+    heading = np.cumsum(turn)
+    before = np.concatenate([[0.0], heading[:-1]])
+    c = np.cos(before)
+    s = np.sin(before)
+    steps = np.column_stack([c * forward - s * left, s * forward + c * left])
+    return np.column_stack([np.cumsum(steps, axis=0), wrap(heading)])

@@ -12,10 +12,11 @@ import numpy as np
 
 from consistency.referee.column_names import POSE
 from consistency.referee.readers.formats.columns import covariance_columns, pose_columns
-from consistency.referee.readers.formats.file_head import fields_of, head_of
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
+    fields_of,
     files_of_runs,
+    head_of,
     is_bag,
     is_plane,
     is_solution,
@@ -23,8 +24,14 @@ from consistency.referee.readers.formats.file_kinds import (
     table_files,
     trajectory_files,
 )
-from consistency.referee.readers.formats.pose_covariances import ORDERS, components_in, covariance_order
-from consistency.referee.readers.formats.pose_rows import DEVIATIONS, FULL, TRIANGLE
+from consistency.referee.readers.formats.pose_rows import (
+    DEVIATIONS,
+    FULL,
+    ORDERS,
+    TRIANGLE,
+    components_in,
+    covariance_order,
+)
 from consistency.referee.readers.formats.pose_rows import POSE_NUMBERS as POSE_NUMBERS
 from consistency.referee.readers.formats.text_blocks import opened
 from consistency.referee.readers.options import Reading

@@ -14,19 +14,16 @@ import numpy as np
 
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
-from consistency.referee.geometry.conventions import SPATIAL
-from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
+from consistency.referee.geometry import SPATIAL, inverse, matrices, vectors
 from consistency.referee.parsing import reading
 from consistency.referee.readers.formats.file_kinds import is_one_bag
-from consistency.referee.readers.formats.geodetic import Fixes
-from consistency.referee.readers.formats.pose_covariances import require_spatial
-from consistency.referee.readers.formats.pose_rows import FULL, POSE_NUMBERS
-from consistency.referee.readers.formats.rotations import not_unit
+from consistency.referee.readers.formats.pose_rows import FULL, POSE_NUMBERS, not_unit, require_spatial
+from consistency.referee.readers.formats.positions import Fixes
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.formats.tum import SpaceRun, poses_without_covariances, space_estimator
 from consistency.referee.readers.options import COLUMNS, Reading
+from consistency.referee.readers.runs_to_record import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
-from consistency.referee.readers.windows import MARGINAL
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance

@@ -19,8 +19,8 @@ import numpy as np
 from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, keys_once, one_line, reading, require_name
-from consistency.referee.readers.formats.file_head import Head
-from consistency.referee.readers.formats.spellings import Columns, clock_of, renamed
+from consistency.referee.readers.formats.columns import Columns, clock_of, renamed
+from consistency.referee.readers.formats.file_kinds import Head
 from consistency.referee.readers.formats.text_blocks import (
     Block,
     FileRows,

@@ -9,16 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.records.large_arrays import diagonal
+from consistency.referee.diagnostics.records.whitening import diagonal
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import ADDITIVE, PLANAR
+from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns
-from consistency.referee.readers.formats.columns import covariance_columns, is_pose
-from consistency.referee.readers.formats.file_head import begins_with_numbers, head_of
-from consistency.referee.readers.formats.file_kinds import is_drive, is_plane, is_poses
+from consistency.referee.readers.formats.columns import Columns, covariance_columns, is_pose, naming
+from consistency.referee.readers.formats.file_kinds import begins_with_numbers, head_of, is_drive, is_plane, is_poses
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
-from consistency.referee.readers.formats.spellings import Columns, naming
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import (
@@ -140,7 +138,7 @@ def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = N
         is_table = not head.comment and set(POSE) <= set(head.names)
     if is_table or not (is_poses(path, renaming) or is_plane(path, renaming)):
         return read_sheet(path, renaming), ""
-    from consistency.referee.readers.formats.planar_columns import read_plane
+    from consistency.referee.readers.formats.pose_rows import read_plane
 
     return read_plane(path, motions, renaming)
 

@@ -11,28 +11,26 @@ import numpy as np
 
 from consistency.referee.column_names import OWN_COVARIANCE, POSE
 from consistency.referee.errors import InputError
-from consistency.referee.readers.clock_units import unit_of
+from consistency.referee.readers.clocks import unit_of
 from consistency.referee.readers.formats.columns import (
-    Entries,
-    covariance_columns,
-    entries_of,
-    entry_name,
-    is_pose,
-    state_columns,
-)
-from consistency.referee.readers.formats.file_head import fields_of
-from consistency.referee.readers.formats.sheet import DOF_NEEDED, NIS_DOF, TableRows, are_dof, checked_dof
-from consistency.referee.readers.formats.spellings import (
     OWN,
     QUATERNIONS,
     TRUE,
     Clock,
+    Entries,
     clock_of,
+    covariance_columns,
+    entries_of,
+    entry_name,
+    is_pose,
     naming,
     places_of,
     require_units,
+    state_columns,
     stem_of,
 )
+from consistency.referee.readers.formats.file_kinds import fields_of
+from consistency.referee.readers.formats.sheet import DOF_NEEDED, NIS_DOF, TableRows, are_dof, checked_dof
 from consistency.referee.readers.formats.text_blocks import FileRows, blocks
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, listed, refuse
@@ -424,7 +422,7 @@ def _with_innovations(sheet: TableRows, places: Mapping[str, int], dof: int | No
             S[:, i, j] = column
             if (j, i) not in stated.places:
                 S[:, j, i] = column
-        from consistency.referee.diagnostics.questions.innovations import nis_of
+        from consistency.referee.diagnostics.questions.whiteness import nis_of
 
         nis, degrees = nis_of(v, S)
         alone = ""

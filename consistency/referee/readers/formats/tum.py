@@ -11,33 +11,34 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import INERTIAL, PLANAR
-from consistency.referee.readers.formats import pose_covariances as stated_as
+from consistency.referee.geometry import INERTIAL, PLANAR
+from consistency.referee.readers.formats import pose_rows as stated_as
+from consistency.referee.readers.formats.columns import Columns
 from consistency.referee.readers.formats.file_kinds import files_of_runs, is_drive, paired
-from consistency.referee.readers.formats.geodetic import Fixes, localised
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.readers.formats.pose_covariances import ORDERS
 from consistency.referee.readers.formats.pose_rows import (
     DEVIATIONS,
     DEVIATIONS_LAYOUT,
     FULL,
+    ORDERS,
     POINT,
     POSE_NUMBERS,
     SPLIT,
     States,
+    not_unit,
     read_beside,
     read_deviations,
     read_poses,
 )
-from consistency.referee.readers.formats.position_truth import (
+from consistency.referee.readers.formats.positions import (
+    Fixes,
     fixed,
+    localised,
     placeholder,
     point_positions,
     position_note,
     require_positions,
 )
-from consistency.referee.readers.formats.rotations import not_unit
-from consistency.referee.readers.formats.spellings import Columns
 from consistency.referee.readers.formats.text_blocks import Lines
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import listed, one_of_each_kind, refuse

@@ -12,9 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from consistency.referee.readers.mix_ups.known import Guess, guesses_of
-from consistency.referee.readers.mix_ups.known_turns import turns_of
-from consistency.referee.readers.mix_ups.known_worlds import worlds_of
+from consistency.referee.readers.mix_ups.known import Guess, guesses_of, turns_of, worlds_of
 from consistency.referee.readers.mix_ups.reading_fit import LEAST_GAIN, SCALE, ReadingFit, fit_of, is_same, thinned
 from consistency.referee.readers.truth_matching import Change, Poses, submatrices
 from consistency.referee.types import Array

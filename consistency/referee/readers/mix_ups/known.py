@@ -1,4 +1,7 @@
-"""The mix-ups in files that are looked for: a unit, order, side or convention of one file or of both."""
+"""The mix-ups in files that are looked for.
+
+A unit, order, side, frame or convention of one file or of both, or a covariance in other axes.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,18 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.geometry.conventions import PLANAR, SPATIAL
-from consistency.referee.geometry.lie_groups import inverse, matrices, vectors
-from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, submatrices
+from consistency.referee.geometry import PLANAR, SPATIAL, inverse, matrices, vectors, wrap
+from consistency.referee.readers.alignment import (
+    BodyTransform,
+    WorldTransform,
+    fitted_body,
+    fitted_frame,
+    moved,
+    on_body,
+    rotations,
+    spread,
+)
+from consistency.referee.readers.truth_matching import Change, Poses, finite_rows, nearest, submatrices
 from consistency.referee.types import Array
 
 ALL_ORDERS = 4  # components up to which all orders are looked at
@@ -25,10 +37,15 @@ SINGULAR = 1e-3  # smallest eigenvalue of a correlation from which on a directio
 SAME = 0.9  # share of a direction that is the same in all steps
 WORK = 1e8  # multiplications at most to look for such directions
 UNIT = 1e-3  # lengths of quaternions differ by less from 1
-
 OF = {"both files": ("estimate", "truth"), "the estimates": ("estimate",), "the truth": ("truth",)}  # fields of poses
-
 Function = Callable[[Any], Any]  # of a field of poses
+ARM = 1e-3  # of the size of the path: shorter lever arms are not named
+TURN = 3.0  # degrees: frames that differ by less are not named
+SHIFT = 0.05  # of the size of the path
+IN_WORLD = ("so2", "so3", "so3-body", "vector")  # errors whose position is along the axes of the world
+NAMES = ("x y z", "px py pz", "pos_x pos_y pos_z", "east north up", "e n u", "north east down", "n e d")
+SPEED = "v{}"  # name of a component of the velocity, of the axis
+Axes = Callable[[Poses, list[int]], Array]  # columns (N, d, d) of axes at each estimate, of positions at these places
 
 
 @dataclass(frozen=True)
@@ -401,3 +418,189 @@ def _units(width: int, angles: slice) -> Iterator[Guess]:
     words = f"the positions of the truth are {remedy}"
     volume = width * float(np.log(MILLI))
     yield Guess(words, changed(truth=shrunk), fine=False, volume=volume)
+
+
+def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
+    """Possible mix-ups of the worlds and bodies of poses, the likelier first; none of other states."""
+    kind = runs[0].manifold
+    convention = runs[0].convention
+    if kind == "vector" or runs[0].covariance.shape[-1] > 6:
+        return []
+    axes = _ned() if kind == "spatial" else [_mirrored(convention)]
+    return [*axes, *_frames(runs), *_bodies(runs)]
+
+
+def _ned() -> Iterator[Guess]:
+    """A world whose z points down, with a body whose z does so too or not."""
+    swapped = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    north = WorldTransform(swapped, np.zeros(3))
+    down = BodyTransform(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+    worlds = "one file is in a world of x north, y east, z down, the other in one of x east, y north, z up"
+    remedy = "add --world ned{0} if that is the estimates, --truth-world ned{1} if it is the truth"
+    yield Guess(f"{worlds}; {remedy.format('', '')}", lambda p: moved(p, north), fine=False)
+    remedy = remedy.format(" --body-axes frd", " --truth-body-axes frd")
+    words = f"{worlds}, and their bodies have z down and z up; {remedy}"
+    yield Guess(words, lambda p: on_body(moved(p, north), down), fine=False)
+
+
+def _mirrored(convention: str) -> Guess:
+    """A plane whose x is north and y east."""
+    A = np.diag([1.0, -1.0, -1.0])
+    if convention != "left":
+        A[:2, :2] = [[0.0, 1.0], [1.0, 0.0]]
+
+    def swapped(pose: Array) -> Array:
+        x, y, heading = pose.T
+        return np.column_stack([y, x, wrap(0.5 * np.pi - heading)])
+
+    words = "one file is in a plane of x north, y east, the other in one of x east, y north"
+    remedy = "add --world ned if that is the estimates, --truth-world ned if it is the truth"
+    change = changed(estimate=swapped, covariance=lambda P: A @ P @ A.T)
+    return Guess(f"{words}; {remedy}", change, fine=False)
+
+
+def _frames(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The worlds of the files differ by a turn about z and a shift, the same in all runs, or another in each."""
+    frame = fitted_frame(runs)
+    if frame is None or not (size := spread(runs)) > 0:
+        return
+    angle = np.rad2deg(frame.heading)
+    several = len(runs) > 1
+    if abs(angle) >= TURN or np.linalg.norm(frame.shift) >= SHIFT * size:
+        turn = ""
+        mode = "posyaw"
+        if abs(angle) > TURN:
+            turn = f"turned by {angle:.1f} degrees about z and "
+        if several:
+            mode = "posyaw-all"
+        words = (
+            f"the world of the estimates is {turn}shifted by {_place(frame.shift, runs)} m to meet that of the truth; "
+            f"write both in one world, or add --align {mode}"
+        )
+        yield Guess(words, lambda p: moved(p, frame), fine=False)
+    if several:
+        words = "each run is turned about z and shifted by itself to meet the truth; add --align posyaw"
+        yield Guess(words, lambda p: moved(p, fitted_frame([p]) or frame), last=True, fine=False)
+
+
+def _bodies(runs: Sequence[Poses]) -> Iterator[Guess]:
+    """The bodies of the files differ by a constant turn or lever arm."""
+    body = fitted_body(runs)
+    if body is None:
+        return
+    angle = np.round(np.rad2deg(body.turn.as_rotvec()), 1) + 0.0
+    size = spread(runs)
+    parts = []
+    if np.linalg.norm(angle) >= TURN:
+        turned = f"({angle[0]:.1f}, {angle[1]:.1f}, {angle[2]:.1f}) degrees about x, y, z"
+        if runs[0].manifold == "planar":
+            turned = f"{angle[2]:.1f} degrees about z"
+        parts.append(f"turned by {turned}")
+    if np.linalg.norm(body.arm) >= ARM * size:
+        parts.append(f"shifted by a lever arm of {_place(body.arm, runs)} m")
+    if parts:
+        words = f"the body of the truth is {' and '.join(parts)} against that of the estimates; write poses of one body"
+        yield Guess(words, lambda p: on_body(p, body), fine=False)
+
+
+def _place(values: Array, runs: Sequence[Poses]) -> str:
+    """Coordinates in space, or x and y."""
+    d = 2 if runs[0].manifold == "planar" else 3
+    return f"({', '.join(f'{value:.3g}' for value in values[:d])})"
+
+
+def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
+    """Possible mix-ups of the axes of the covariance of positions, and of velocities beside them."""
+    blocks = _position_blocks(runs[0], [axis.lower() for axis in axes])
+    if not blocks or runs[0].convention not in IN_WORLD:
+        return
+    if not any(np.ptp(p.estimate[:, blocks[0]], axis=0).any() for p in runs if len(p.t)):
+        return  # errors without places
+    names = ", ".join(axes[i] for i in blocks[0])
+    own = f"turn it into the axes of {names}"
+    in_space = len(blocks[0]) == 3
+    if in_space:
+        words = f"the covariance of {names} is along radius, track and normal; {own}"
+        yield _turned(words, _orbital, blocks)
+    words = f"the covariance of {names} is along and across the motion; {own}"
+    yield _turned(words, _along, blocks)
+    turn = "course" if runs[0].manifold == "vector" else "heading"
+    words = f"the covariance of {names} is turned by the negative {turn}; turn it by the {turn} itself"
+    yield _turned(words, _wrong_way, blocks)
+
+
+def _position_blocks(p: Poses, axes: Sequence[str]) -> list[list[int]]:
+    """Places of the positions, and of velocities along the same axes; none where the state has no positions."""
+    if p.manifold != "vector":
+        poses_alone = p.covariance.shape[-1] <= 6
+        return [list(range(p.d))] if poses_alone else []
+    for names in map(str.split, NAMES):
+        for d in (3, 2):
+            speeds = list(map(SPEED.format, names[:d]))
+            blocks = [list(map(axes.index, some)) for some in (names[:d], speeds) if set(some) <= set(axes)]
+            if blocks and set(names[:d]) <= set(axes):
+                return blocks
+    return [list(range(len(axes)))] if len(axes) in (2, 3) else []
+
+
+def _turned(words: str, axes: Axes, blocks: list[list[int]]) -> Guess:
+    """Covariances in axes of their own, turned into those of the error."""
+
+    def change(p: Poses) -> Poses:
+        n = p.covariance.shape[-1]
+        own = axes(p, blocks[0])
+        T = np.tile(np.eye(n), (len(own), 1, 1))
+        for block in blocks:
+            T[np.ix_(range(len(own)), block, block)] = own
+        return replace(p, covariance=T @ p.covariance @ np.swapaxes(T, 1, 2))
+
+    return Guess(words, change)
+
+
+def _motion(p: Poses, places: list[int]) -> tuple[Array, Array]:
+    """True positions beside the estimates and their changes from sample to sample, (N, d) both.
+
+    Where nothing moves, the motion is that before.
+    """
+    last = len(p.true_t) - 1
+    before = np.clip(np.searchsorted(p.true_t, p.t, side="right") - 1, 0, last)
+    at = nearest(p.t, p.true_t, before)
+    true = p.truth[:, places]
+    change = true[np.minimum(at + 1, last)] - true[np.maximum(at - 1, 0)]
+    moves = (change != 0).any(axis=1)
+    latest = np.maximum.accumulate(np.where(moves, np.arange(len(at)), 0))
+    return true[at], change[latest]
+
+
+def _along(p: Poses, places: list[int]) -> Array:
+    """Along the motion over ground, to its left, and up."""
+    _, change = _motion(p, places)
+    return _about_z(np.arctan2(change[:, 1], change[:, 0]), len(places))
+
+
+def _wrong_way(p: Poses, places: list[int]) -> Array:
+    """What is turned by the negative heading, or course, is right if it is turned by the heading twice."""
+    if p.manifold == "vector":
+        _, change = _motion(p, places)
+        return _about_z(2.0 * np.arctan2(change[:, 1], change[:, 0]), len(places))
+    forward = rotations(p.estimate, p.manifold).apply([1.0, 0.0, 0.0])
+    return _about_z(2.0 * np.arctan2(forward[:, 1], forward[:, 0]), len(places))
+
+
+def _about_z(angle: Array, d: int) -> Array:
+    """Turns (N, d, d) about z."""
+    R = np.tile(np.eye(d), (len(angle), 1, 1))
+    c = np.cos(angle)
+    s = np.sin(angle)
+    R[:, :2, :2] = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    return R
+
+
+def _orbital(p: Poses, places: list[int]) -> Array:
+    """Along the radius, to the front, and normal to both."""
+    place, change = _motion(p, places)
+    normal = np.cross(place, change)
+    track = np.cross(normal, place)
+    axes = np.stack([place, track, normal], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.valid_covariances import ROUNDED
+from consistency.referee.diagnostics.records.whitening import ROUNDED
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics.records.large_arrays import diagonal
 from consistency.referee.diagnostics.records.record import Record, each_alone
+from consistency.referee.diagnostics.records.whitening import diagonal
 from consistency.referee.diagnostics.words.numbers import is_or_are
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.formats.archive_arrays import require_layout
-from consistency.referee.readers.formats.numpy_archive import estimator_of_arrays
+from consistency.referee.readers.formats.archives import estimator_of_arrays, require_layout
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.truth_matching import Estimator

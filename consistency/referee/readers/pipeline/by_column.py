@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics.records.groups_by_column import BINS, Column, column_of, groups_of, on_steps
-from consistency.referee.diagnostics.records.outcome_columns import made_from_errors, selects_on_outcome
+from consistency.referee.diagnostics.records.groups import (
+    BINS,
+    Column,
+    column_of,
+    groups_of,
+    made_from_errors,
+    on_steps,
+    selects_on_outcome,
+)
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading

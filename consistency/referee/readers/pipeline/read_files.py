@@ -14,8 +14,9 @@ from typing import Any, NamedTuple, cast
 
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.conventions import CHARTS, INERTIAL, PLANAR, SPATIAL
+from consistency.referee.geometry import CHARTS, INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import is_file, read_json, require_name
+from consistency.referee.readers.formats.columns import columns_of_axes
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     TABLES,
@@ -30,7 +31,6 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.formats.spellings import columns_of_axes
 from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
@@ -82,7 +82,7 @@ def _bags(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 
 def _archive(path: Path, r: Reading, poses_alone: bool) -> Found:
-    from consistency.referee.readers.formats.numpy_archive import read_archive
+    from consistency.referee.readers.formats.archives import read_archive
 
     return read_archive(path, r, poses_alone)
 
@@ -106,7 +106,7 @@ def _program_runs(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 
 def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
-    from consistency.referee.readers.pipeline.run_folders import read_table_folder
+    from consistency.referee.readers.pipeline.program_runs import read_table_folder
 
     return read_table_folder(path, r, poses_alone)
 
@@ -286,7 +286,7 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
     pieces = pieces_asked(r)
     if pieces is None:
         return records
-    from consistency.referee.diagnostics.planning.single_log import in_pieces
+    from consistency.referee.diagnostics.questions.planning import in_pieces
 
     return [in_pieces(record, pieces or None) for record in records]
 
@@ -314,7 +314,7 @@ def _records(found: Found, r: Reading) -> list[Record]:
 def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
     """Records of the runs of an estimator, with those that left no estimates."""
     if r.given(OF_AXES):
-        from consistency.referee.readers.declared_axes import in_axes_of_estimates
+        from consistency.referee.readers.axes_and_units import in_axes_of_estimates
 
         e = in_axes_of_estimates(e, r)
     records = []

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.diagnostics.records.record import Record, each_alone
-from consistency.referee.diagnostics.records.valid_covariances import ROUNDED, Validity, classify
+from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
-from consistency.referee.readers.heading_units import require_radians
+from consistency.referee.readers.axes_and_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import exact, refuse
@@ -38,7 +38,7 @@ from consistency.referee.readers.truth_matching import (
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.readers.windows import Relative
+    from consistency.referee.readers.runs_to_record import Relative
 
 OF_WINDOWS = ("relative", "motions", "windows")  # options
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
@@ -82,7 +82,7 @@ def windows_asked(r: Reading) -> Relative | None:
     """Windows of ``--relative`` that are judged in place of poses; None without the option."""
     if not r.given(OF_WINDOWS):
         return None
-    from consistency.referee.readers.windows import relative_of
+    from consistency.referee.readers.runs_to_record import relative_of
 
     return relative_of(r.relative, bool(r.motions), r.windows)
 
@@ -114,14 +114,14 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     of_clocks: list[str] = []
     of_alignment: dict[str, Any] = {}
     if r.align is not None:
-        from consistency.referee.readers.alignment.residuals import clocks_and_frames
+        from consistency.referee.readers.alignment import clocks_and_frames
 
         shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
         runs = moved.runs
         of_alignment = moved.of_record
         of_clocks += moved.notes
     elif not runs[0].numbered:
-        from consistency.referee.readers.clock_offset import clock_shift
+        from consistency.referee.readers.clocks import clock_shift
 
         shift, of_clocks = clock_shift(e.said, runs, r.time_offset, judged)
     pairs = [_paired(e, p, r, shift) for p in runs]
@@ -197,7 +197,7 @@ def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
     if p.numbered:
         own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.t, p.true_t))
         return InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
-    from consistency.referee.readers.clock_units import nothing_near
+    from consistency.referee.readers.clocks import nothing_near
 
     what = "estimate"
     if len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files:

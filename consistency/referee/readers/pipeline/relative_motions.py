@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.independence import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.questions.whiteness import ENOUGH, Independence, independence
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.records.whitening import whiten
 from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, plural
 from consistency.referee.errors import InputError
-from consistency.referee.geometry.lie_groups import adjoint, composed, inverse, log, matrices, propagated, to_left
+from consistency.referee.geometry import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.mix_ups.hints import Pairs, hints
-from consistency.referee.readers.runs_to_record import Track, assemble, in_columns
+from consistency.referee.readers.runs_to_record import MARGINAL, Relative, Track, assemble, in_columns, windows
 from consistency.referee.readers.truth_matching import Change, Poses, at, common_times, finite_rows
-from consistency.referee.readers.windows import MARGINAL, Relative, windows
 from consistency.referee.types import Array, Indices
 
 KIND = "left"

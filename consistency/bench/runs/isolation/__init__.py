@@ -1,1 +1,0 @@
-"""Filters that are not compiled, in processes that can be killed."""

@@ -1,1 +1,0 @@
-"""Maps: the NEES of landmarks, alone and together with the pose, and rejected observations."""

@@ -1,1 +1,0 @@
-"""The monitor of a deployed filter, and innovations behind a validation gate."""

@@ -1,1 +1,0 @@
-"""How many runs a verdict needs, and when runs may stop."""

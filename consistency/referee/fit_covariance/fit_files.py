@@ -1,0 +1,564 @@
+"""What a fit leaves as a folder.
+
+A model or a correction in TOML, files of data, lines for other programs, and a page with pictures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import stats
+
+from consistency.referee.defaults import CONFIDENCE, DETECT
+from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.document.blocks import (
+    BAND,
+    EXPECTED,
+    LIMIT,
+    ZERO,
+    Chapter,
+    Document,
+    Figure,
+    Text,
+    solid,
+    style,
+)
+from consistency.referee.fit_covariance.correct import (
+    ByGroup,
+    Correction,
+    by_group,
+    correction_document,
+    correction_sentence,
+    data_of_correction,
+    with_factors,
+)
+from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, write_motions
+from consistency.referee.fit_covariance.estimation import nees_of
+from consistency.referee.fit_covariance.factors import stated_errors
+from consistency.referee.fit_covariance.motion_windows import PIECES, mean_square, span_of, ways
+from consistency.referee.fit_covariance.noise_model import (
+    NoiseModel,
+    correction,
+    data_of_model,
+    error_windows,
+    noise_document,
+)
+from consistency.referee.pages.record_figures import ellipse
+from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
+from consistency.referee.readers.formats.restated import TextFile
+from consistency.referee.readers.formats.sheet import EMPTY
+from consistency.referee.show import as_html, as_json
+from consistency.referee.show.figures import (
+    canvas,
+    curve,
+    dots,
+    intervals,
+    log_axis,
+    name_rows,
+    panel_legend,
+    path,
+    points,
+    stroke,
+)
+from consistency.referee.system.folders import manifest_of, write_folder
+from consistency.referee.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawing
+
+PLACES = {3: (0, 1, 5), 6: (0, 1, 2, 3, 4, 5)}  # of the axes in messages of ROS: x, y, z, roll, pitch, yaw
+HEAD = """\
+Cov Log(D^-1 M) = factor * (sum over steps of A diag(variance_per_m |way| + variance_per_rad |turn|) A'
++ diag(floor)); D is the estimated motion after the correction of [mean], M the true one, and A
+carries a step's error to the end of the motion. Shown for motions over the span, and for no others."""
+SHOWN = 3  # spans with a panel of errors
+MOST_ROWS = 30  # runs that have a row
+ROW = 0.14  # in, height of one
+MANY = 2000  # errors of motions that are drawn
+EACH = replace(style(0), size=2.0, alpha=0.7)
+
+
+def write_fit(
+    folder: Path,
+    kind_and_source: tuple[str, str],
+    texts: dict[str, str],
+    page: Document,
+    data: Callable[[Path], Sequence[str]],
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write what a fit leaves, as a folder that appears whole or not at all; its files.
+
+    Pictures need ``[plot]``; without it the page has none.
+
+    Parameters
+    ----------
+    texts : files by name, the model first
+    page : what is shown, and as data
+    data : writes files of data into a folder, and returns their names
+
+    Raises
+    ------
+    InputError
+        The folder exists or cannot be written.
+    """
+    kind, source = kind_and_source
+    texts = texts | {"verdict.json": as_json.render(page) + "\n", "report.html": as_html.render(page)}
+    names: list[str] = []
+
+    def contents(at: Path) -> None:
+        names.extend(data(at))
+        for name, text in texts.items():
+            (at / name).write_text(text, encoding="utf-8")
+
+    write_folder(folder, manifest_of(kind=kind, source=source), contents, overwrite)
+    first, *rest = texts
+    return [folder / name for name in (first, *names, *rest)]
+
+
+def toml(comment: str, values: Mapping[str, Any]) -> str:
+    """Plain data as TOML below lines of comment; what the referee says is left out, as it is in verdict.json."""
+    lines = [f"# {line}" for line in comment.splitlines()]
+    known = {key: value for key, value in values.items() if key != "referee"}
+    return "\n".join([*lines, *_lines(known)]) + "\n"
+
+
+def _lines(values: Mapping[str, Any], above: str = "") -> list[str]:
+    """Numbers and words, then tables and arrays of tables; a value of None is left out."""
+    lines, tables = [], []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            tables += ["", f"[{above}{key}]", *_lines(value, f"{above}{key}.")]
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            for each in value:
+                tables += ["", f"[[{above}{key}]]", *_lines(each, f"{above}{key}.")]
+        elif value is not None:
+            lines.append(f"{key} = {_text(value)}")
+    return lines + tables
+
+
+def _text(value: Any) -> str:
+    """A number, a word or a list of these, of which None is a number that is not known."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_text, value))}]"
+    return "nan" if value is None else json.dumps(value, ensure_ascii=False)
+
+
+def write_model(model: NoiseModel, folder: Path, overwrite: bool = False) -> list[Path]:
+    """Write the folder of a noise model; its files."""
+    motions = partial(write_motions, model.stretches)
+    return write_fit(folder, ("noise", model.name), snippets(model), noise_page(model), motions, overwrite)
+
+
+def robot_localization(model: NoiseModel) -> str:
+    """A function of the covariance of a twist message, whose integration has the covariance of the model."""
+    noise = model.noise
+    places = PLACES[len(noise.axes)]
+    at_rest = noise.floor / seconds(model)
+    numbers = noise.factor * np.column_stack([noise.per_m, noise.per_rad, at_rest])
+    rows = []
+    for axis, place, (per_m, per_rad, rest) in zip(noise.axes, places, numbers.tolist(), strict=True):
+        variance = f"{per_m:.17g} * abs(v) + {per_rad:.17g} * abs(w) + {rest:.17g}"
+        rows.append(f"    covariance[{7 * place}] = ({variance}) / dt  # {axis}")
+    if len(places) < 6:
+        rows.append("    # z, roll, pitch: set two_d_mode")
+    assignments = "\n".join(rows)
+    return f'''"""robot_localization: fuse the twist of the odometry, not its pose. {_origin(model)}
+
+In differential mode two poses are turned into a twist with the sum of their covariances, which is not that
+of a motion; a twist is integrated as it is. Set odom0_config to the velocities alone.
+"""
+
+
+def twist_covariance(v: float, w: float, dt: float) -> list[float]:
+    """36 numbers of a TwistWithCovariance: v in m/s, w in rad/s, dt in s since the message before."""
+    covariance = [0.0] * 36
+{assignments}
+    return covariance
+'''
+
+
+def seconds(model: NoiseModel) -> float:
+    """Median time that a motion over the span takes, s, over which the floor is spread; 1 without a clock."""
+    windows = model.windows
+    took = []
+    for i, first, last in zip(windows.drive, windows.first, windows.last, strict=True):
+        took.append(np.ptp(windows.drives[i].t[[first, last]]))
+    median = float(np.median(took))
+    return median if np.isfinite(median) and median > 0 else 1.0
+
+
+def gtsam(model: NoiseModel) -> str:
+    """A function of the noise model of a BetweenFactor."""
+    noise = model.noise
+    n = len(noise.axes)
+    # Pose3 has the rotation first, Pose2 the position
+    order, turn, kind = [0, 1, 2], "[2:]", "Pose2"
+    if n == 6:
+        order, turn, kind = [3, 4, 5, 0, 1, 2], "[:3]", "Pose3"
+    return f'''"""GTSAM: noise of a BetweenFactor{kind}. {_origin(model)}"""
+
+import gtsam
+import numpy as np
+
+# {", ".join(noise.axes[i] for i in order)}: the order of gtsam.{kind}
+PER_M = np.array([{_numbers(noise.factor * noise.per_m[order])}])
+PER_RAD = np.array([{_numbers(noise.factor * noise.per_rad[order])}])
+FLOOR = np.array([{_numbers(noise.factor * noise.floor[order])}])
+PIECES = {PIECES}
+
+
+def covariance(delta: gtsam.{kind}) -> np.ndarray:
+    """Of the error Log(delta^-1 true) of a corrected motion over the span, taken as even."""
+    xi = gtsam.{kind}.Logmap(delta) / PIECES
+    way, turn = np.linalg.norm(np.asarray(gtsam.{kind}.Expmap(xi).translation())), np.linalg.norm(xi{turn})
+    Q, S = np.diag(PER_M * way + PER_RAD * turn), np.zeros(({n}, {n}))
+    for k in range(PIECES + 1):
+        A = gtsam.{kind}.Expmap(-k * xi).AdjointMap()
+        S += (0.5 if k in (0, PIECES) else 1.0) * A @ Q @ A.T
+    return S + np.diag(FLOOR)
+
+
+def noise(delta: gtsam.{kind}) -> gtsam.noiseModel.Gaussian:
+    """Noise model of gtsam.BetweenFactor{kind}(i, j, delta, noise(delta))."""
+    return gtsam.noiseModel.Gaussian.Covariance(covariance(delta))
+'''
+
+
+def ceres(model: NoiseModel) -> str:
+    """A header with the square root of the information of a straight motion over the span."""
+    root = np.linalg.cholesky(np.linalg.inv(straight(model))).T
+    rows = ",\n".join(f"    {_numbers(row)}" for row in root)
+    return f"""// Ceres: residual = kSqrtInformation * Log(D^-1 M), with {", ".join(model.noise.axes)} in this order.
+// {_origin(model)}
+// Of a straight motion over the span; for others take the inverse square root of the covariance in motions.csv.
+#pragma once
+
+constexpr int kErrorSize = {len(root)};
+constexpr double kSqrtInformation[{root.size}] = {{
+{rows}}};
+"""
+
+
+def straight(model: NoiseModel) -> Array:
+    """Covariance (n, n) of a straight motion as long as the median one of the windows."""
+    corrected = model.noise.mean.corrected(model.windows.pieces)
+    way = float(np.median(ways(corrected).sum(axis=1)))
+    if model.windows.d == 2:
+        return model.covariance([way, 0.0, 0.0])
+    return model.covariance([way, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+
+def _origin(model: NoiseModel) -> str:
+    """Span and correction, for the head of a file."""
+    return f"Shown for motions over {model.span} alone; {correction(model) or 'nothing is corrected'}."
+
+
+def _numbers(values: Array) -> str:
+    return ", ".join(f"{value:.17g}" for value in values)
+
+
+def snippets(model: NoiseModel) -> dict[str, str]:
+    """Files of the model for other programs, by name."""
+    return {
+        "noise.toml": toml(HEAD, data_of_model(model)),
+        "robot_localization_noise.py": robot_localization(model),
+        "gtsam_noise.py": gtsam(model),
+        "ceres_noise.h": ceres(model),
+    }
+
+
+def write_correction(
+    found: Correction, record: Record, files: Sequence[TextFile], folder: Path, overwrite: bool = False
+) -> list[Path]:
+    """Write the folder of a correction; its files.
+
+    Parameters
+    ----------
+    record : all runs, as they are stated
+    files : that the covariances came in; without any the errors and covariances are written as archives of NumPy
+    """
+    write = partial(_write_runs, found, record, files)
+    head = f"{found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component."
+    texts = {"correction.toml": toml(head, data_of_correction(found)), "corrected_covariance.py": pasted(found)}
+    return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
+
+
+def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:
+    """Write held-out/, each judged run by the factors of others, and corrected/, all runs by the factors of all.
+
+    Returns the names of what ``analyse`` reads: a file, or a folder of trajectories.
+    """
+    held_out = dict(zip(found.before.record.run_numbers.tolist(), found.used, strict=True))
+    groups = record.groups
+    is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
+    are_runs = record.unit == "run"  # pieces of one log are not in its file
+    runs = record.run_numbers.tolist()
+    if is_text and not are_runs:
+        runs = [file.run for file in files]
+    corrected = dict.fromkeys(runs, by_group(found.fits))
+    return [
+        _write_one(folder / HELD_OUT, found, record, files if is_text and are_runs else (), held_out),
+        _write_one(folder / CORRECTED, found, record, files if is_text else (), corrected),
+    ]
+
+
+def _write_one(
+    folder: Path, found: Correction, record: Record, files: Sequence[TextFile], of_runs: dict[int, ByGroup]
+) -> str:
+    """Write runs by their factors, as text or as an archive; the name of the file, or of the folder of several."""
+    folder.mkdir()
+    if not files:
+        _write_archive(folder / f"{found.name}.npz", record, of_runs)
+        return f"{folder.name}/{found.name}.npz"
+    change = partial(_change, found.axes, record.groups, of_runs)
+    for file in files:
+        if file.run_column is not None or file.run in of_runs:
+            (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
+    made = [path.name for path in folder.iterdir()]
+    return f"{folder.name}/{made[0]}" if len(made) == 1 else folder.name
+
+
+def _change(
+    axes: Sequence[str], groups: Groups | None, of_runs: dict[int, ByGroup], run: int, value: str
+) -> dict[str, tuple[float, float]] | None:
+    """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out."""
+    if run not in of_runs:
+        return None
+    return of_runs[run][place_in(groups, value)].by_name(axes)
+
+
+def place_in(groups: Groups | None, value: str) -> int:
+    """The group of a value as it stands in a file; -1 where it is in none."""
+    if groups is None or value.strip() in EMPTY:
+        return -1
+    if groups.edges is None:
+        name = f"{groups.column} is {value.strip()}"
+        return groups.names.index(name) if name in groups.names else -1
+    number = float(value)
+    return int(np.searchsorted(groups.edges, number)) if np.isfinite(number) else -1
+
+
+def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> None:
+    """Errors and covariances as an archive that ``analyse`` reads, masked where a step does not count."""
+    rows = np.flatnonzero(np.isin(record.run_numbers, list(of_runs)))
+    some = record.of_runs(rows)
+    used = [of_runs[run] for run in some.run_numbers.tolist()]
+    error, P, nees = stated_errors(with_factors(some, used))
+    counted = np.isfinite(nees)
+    mask = ~counted
+    for failure in some.failures:  # which stay failures
+        mask[some.run_numbers == failure.run, failure.step - 1 :] = False
+    axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
+    np.savez(
+        path,
+        errors=error,
+        covariances=np.where(counted[..., None, None], P, np.eye(record.dof)),
+        mask=mask,
+        axes=axes,
+    )
+
+
+# --- lines for other programs -----------------------------------------------------------------------------------------
+
+
+def pasted(found: Correction) -> str:
+    """corrected_covariance.py: functions of a stated covariance in plain Python, for messages of ROS, and for GTSAM."""
+    groups = found.before.record.groups
+    value, given, place = "", "", 'FACTORS[""]'
+    if len(found.fits) > 1 and groups is not None:
+        value, given = ", value", f" at a value of {groups.column}"
+        place = f'FACTORS[f"{groups.column} is {{value}}"]'
+        if groups.edges is not None:
+            place = f"list(FACTORS.values())[bisect.bisect_left({list(groups.edges)}, value)]"
+    table = "".join(f"    {group!r}: {fit.factors.by_name(found.axes)},\n" for group, fit in found.shown.items())
+    turn = "heading" if "heading" in found.axes else "yaw"
+    order = ("x", "y", turn) if turn == "heading" else ("roll", "pitch", "yaw", "x", "y", "z")  # of Pose2, or Pose3
+    return f'''"""Corrected covariances. {correction_sentence(found)}."""
+
+import bisect
+
+AXES = {found.axes}
+ROS = ("x", "y", "z", "roll", "pitch", "{turn}")
+GTSAM = {order}
+FACTORS = {{  # factor and floor on the variance of each component
+{table}}}
+
+
+def corrected(P{value}, axes=AXES):
+    """P' = D P D + F of a covariance P{given}, rows of numbers in the order of axes."""
+    known = {place}
+    factors = [known.get(axis, (1.0, 0.0)) for axis in axes]
+    better = [
+        [(s * t) ** 0.5 * number for (t, _), number in zip(factors, row)]
+        for (s, _), row in zip(factors, P)
+    ]
+    for i, (_, floor) in enumerate(factors):
+        better[i][i] += floor
+    return better
+
+
+def ros_covariance(numbers{value}):
+    """36 numbers of a PoseWithCovariance, row by row; robot_localization takes them from the message."""
+    rows = [numbers[6 * i : 6 * i + 6] for i in range(6)]
+    return [number for row in corrected(rows{value}, axes=ROS) for number in row]
+
+
+def gtsam_noise(P{value}):
+    """Noise model of a pose, for a factor: P in the order of gtsam, {", ".join(order)}."""
+    import gtsam
+
+    return gtsam.noiseModel.Gaussian.Covariance(corrected(P{value}, axes=GTSAM))
+'''
+
+
+def page_of(
+    said: Document,
+    title: str,
+    caption: str,
+    draw: Callable[[], Drawing],
+) -> Document:
+    """A document with its picture; its first sentence is the answer at the top of the page."""
+    sentence, *further = said.opening
+    assert isinstance(sentence, Text)
+    picture = Figure(title, caption, (draw,))
+    return replace(said, answer=sentence.text, opening=tuple(further), chapters=(Chapter("", "", "", (picture,)),))
+
+
+# --- noise models -----------------------------------------------------------------------------------------------------
+
+
+def noise_page(model: NoiseModel) -> Document:
+    """What the model says, and its picture."""
+    caption = (
+        "Errors of corrected motions in x and y, in the body's frame at their end, with the ellipse that holds "
+        "95 % of them where the covariance is right (the mean of all windows). Below: mean squared error of each axis "
+        "over the span (markers) beside the model, which is fitted at the shortest span alone (lines); and the ratio "
+        "of true to stated covariance of each judged drive."
+    )
+    return page_of(noise_document(model), "Errors of motions, growth and ratios", caption, partial(draw_noise, model))
+
+
+def draw_noise(model: NoiseModel) -> Drawing:
+    """Errors of the first spans, a panel each, and below them growth and drives."""
+    spans = model.spans[:SHOWN]
+    axes = range(len(model.noise.axes))
+    d = model.windows.d
+    figure, panels = canvas(4.0, 3, len(spans) + 3)
+    for panel, judged in zip(panels, spans, strict=False):
+        _draw_errors(panel, model, judged)
+    growth, turns, drives = panels[-3:]
+    _draw_growth(growth, model, axes[:d], "m²")
+    _draw_growth(turns, model, axes[d:], "rad²")
+    _draw_drives(drives, model)
+    return figure
+
+
+def _draw_errors(axes: Axes, model: NoiseModel, judged: JudgedSpan) -> None:
+    windows = error_windows(model, judged)
+    error = windows.errors[:, :2]
+    C = model.noise.covariance(windows.pieces)[:, :2, :2]
+    inside = float((nees_of(error, C) < stats.chi2.ppf(CONFIDENCE, 2)).mean())
+    axes.axvline(0.0, **stroke(ZERO))
+    axes.axhline(0.0, **stroke(ZERO))
+    points(axes, error[:, 0], error[:, 1], EACH, limit=MANY)
+    path(axes, ellipse(np.zeros(2), C.mean(axis=0)), solid(style(1)))
+    title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
+    axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
+
+
+def _draw_growth(
+    panel: Axes,
+    model: NoiseModel,
+    axes: Sequence[int],
+    unit: str,
+) -> None:
+    found = [error_windows(model, judged) for judged in model.spans]
+    spans = np.array([windows.span.size for windows in found])
+    squares = np.array([mean_square(windows.errors) for windows in found])
+    stated = np.array([model.noise.variances(windows.pieces).mean(axis=0) for windows in found])
+    for number, axis in enumerate(axes):
+        curve(panel, spans, stated[:, axis], solid(style(number)))
+        panel.plot(spans, squares[:, axis], label=model.noise.axes[axis], **dots(style(number)))
+    unit_of_span = {"step": "steps"}.get(found[0].span.unit, found[0].span.unit)
+    panel.set(xlabel=f"span ({unit_of_span})", ylabel=f"mean squared error ({unit})")
+    log_axis(panel, "x")
+    log_axis(panel, "y")
+    panel_legend(panel)
+
+
+def _draw_drives(axes: Axes, model: NoiseModel) -> None:
+    """Ratio of true to stated covariance, a row for each drive."""
+    ratios = model.spans[0].by_drive[:, 0]
+    known = np.flatnonzero(np.isfinite(ratios))
+    draw_ratios(axes, [model.drives[i].name for i in known], ratios[known])
+    axes.axvline(model.ratio.value, **stroke(LIMIT))
+    most = 1.1 * float(ratios[known].max())
+    axes.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, most)))
+
+
+def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
+    """Ratios of true to stated covariance, a row for each name, beside those that count as consistent."""
+    name_rows(axes, names)
+    axes.axvspan(1.0 / DETECT, DETECT, color=BAND, linewidth=0, zorder=0.4)
+    axes.axvline(1.0, **stroke(EXPECTED))
+    for number, values in enumerate(ratios):
+        axes.plot(values, np.arange(len(values)), **dots(style(number)))
+    axes.set_xlabel("true / stated")
+
+
+# --- corrections ------------------------------------------------------------------------------------------------------
+
+
+def correction_page(found: Correction) -> Document:
+    """What a correction says, and its pictures."""
+    caption = (
+        "Ratio of true to stated covariance of each held-out run, as stated and corrected; the factor of each block "
+        "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
+    )
+    title = "Held-out runs, factors and coverage"
+    return page_of(correction_document(found), title, caption, partial(draw_correction, found))
+
+
+def draw_correction(found: Correction) -> Drawing:
+    """Ratios of held-out runs, factors, and coverage."""
+    judged = len(found.judged)
+    rows = np.linspace(0, judged - 1, min(MOST_ROWS, judged)).round().astype(int)
+    figure, (runs, factors, coverage) = canvas(max(2.4, ROW * len(rows)), 3, 3)
+    ratios = found.before.ratios, found.after.ratios
+    draw_ratios(runs, np.array(found.judged)[rows], *(each[rows] for each in ratios))
+    log_axis(runs, "x")
+    _draw_factors(factors, found)
+    _draw_coverage(coverage, found)
+    return figure
+
+
+def _draw_factors(axes: Axes, found: Correction) -> None:
+    """The factor of each block with its interval, a row for each."""
+    names = [f"{group} {block.name}".strip() for group in found.shown for block in found.blocks]
+    values = np.array([factor for fit in found.shown.values() for factor in fit.factor])
+    high = values[:, 2].max()
+    low = max(values[:, 1].min(), 1e-3 * high)  # a factor may be 0
+    name_rows(axes, names)
+    axes.axvline(1.0, **stroke(EXPECTED))
+    axes.set_xlim(min(0.7, 0.8 * low), max(1.4, 1.25 * high))
+    intervals(axes, np.arange(len(names), dtype=float), values, style(1))
+    log_axis(axes, "x")
+    axes.set(xlabel="factor on variances")
+
+
+def _draw_coverage(axes: Axes, found: Correction) -> None:
+    """Share of held-out errors inside the ellipsoid of each probability."""
+    levels = np.linspace(0.01, 0.99, 50)
+    axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
+    curve(axes, levels, found.before.covered(levels), solid(style(0)), "stated")
+    curve(axes, levels, found.after.covered(levels), solid(style(1)), "corrected")
+    axes.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
+    panel_legend(axes)

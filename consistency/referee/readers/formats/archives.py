@@ -1,0 +1,634 @@
+"""Archives of arrays by key, (runs, steps, ...).
+
+NumPy (.npz), HDF5 and MATLAB, with states of inertial filters among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from consistency.referee.diagnostics.records.groups import on_steps
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import INERTIAL, PLANAR, state_error
+from consistency.referee.parsing import is_file, reading, require_name, require_room
+from consistency.referee.readers.formats.pose_rows import are_rotations, quaternions
+from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof, checked_dof
+from consistency.referee.readers.formats.text_blocks import bounded
+from consistency.referee.readers.mix_ups.hints import turns
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import Places
+from consistency.referee.readers.runs_to_record import symmetric
+from consistency.referee.readers.truth_matching import Estimator, Poses, at, manifold_of, unstated
+from consistency.referee.types import Array, Failure, Indices
+
+OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
+PLANAR_POSE = ("x", "y", "heading")
+OF_STATES = {"R", "p", "v"}  # of an inertial filter
+BY_STEP: dict[str, Any] = {  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
+    "unavailable": ("distribution",),
+    "caption": "the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
+}
+OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
+FEWEST = 10  # runs and steps from which on swapped arrays are looked for
+ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
+ALIKE = 0.5  # correlation from run to run
+UNLIKE = 0.2  # of it, from step to step
+KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
+# --- files of MATLAB ---------------------------------------------------------------------------------
+
+
+HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
+AXES = {
+    "R": ("roll", "pitch", "yaw"),
+    "p": ("x", "y", "z"),
+    "v": ("vx", "vy", "vz"),
+    "bg": ("bgx", "bgy", "bgz"),
+    "ba": ("bax", "bay", "baz"),
+}  # parts of a state, in their order in the covariance where the key ``order`` names no other
+STATE = ("p", "R", "v", "bg", "ba")  # their order in a state
+TRUE = "true_"  # before the name of a part
+
+
+def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimator | Record]:
+    """The estimator of an archive; its record where it holds NEES.
+
+    ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
+    (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
+    dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
+    (runs,), the number of steps of each run, where they differ, and ``mask`` (runs, steps), true where there is no
+    truth, so that the step does not count. With ``--relative`` estimates and truth are planar
+    poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before. States of
+    inertial filters have keys of their own (:mod:`consistency.referee.readers.formats.archives`).
+
+    Parameters
+    ----------
+    poses_alone : covariances are not looked at
+    """
+    arrays = load_arrays(path)
+    if poses_alone:
+        return [_poses_of_arrays(Archive(path, arrays))]
+    if not set(arrays) >= OF_STATES:
+        return [estimator_of_arrays(path, arrays, r)]
+
+    errors, definition = extended_errors(path, arrays, r.error)
+    one = estimator_of_arrays(path, errors, replace(r, error=None))
+    assert isinstance(one, Estimator)
+    return [replace(one, convention=r.error or "", definition=definition)]
+
+
+def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
+    """Places of steps of a run in arrays."""
+    return Places(lambda row: f"{of}, run {run}, step {row + 1}", rows)
+
+
+# --- estimators and records --------------------------------------------------------------------------
+
+
+def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
+    """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
+    archive = Archive(path, arrays)
+    kind = _kind(archive, r)
+    if kind == OF_NEES:
+        found = _of_nees(archive)
+        assert found.nees is not None
+        return replace(found, by=archive.groups(r, found.nees.shape))
+    declared = ""
+    if kind != OF_NEES:
+        require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
+    if kind == OF_ERRORS:
+        truth = archive.array("errors", 3)
+        estimates = np.where(np.isfinite(truth), 0.0, np.nan)
+    else:
+        estimates, truth = archive.estimates_and_truth()
+        declared = _convention(archive, r, estimates.shape[-1])
+    runs, steps, n = estimates.shape
+    shape = (runs, steps, n, n)
+    by = archive.groups(r, (runs, steps))
+    covariances = archive.matrices("covariances", shape)
+    there = archive.known(runs, steps)
+    if kind == OF_POSES:
+        truth = _finite_truth(path, estimates, truth, there)
+    nis, dof = archive.nis((runs, steps))
+    of_truth = cross = None
+    if "truth_covariances" in archive:
+        of_truth = archive.matrices("truth_covariances", shape)
+    if "cross_covariances" in archive and r.relative is not None and not r.motions:
+        cross = archive.matrices("cross_covariances", shape)
+    convention = declared or "vector"
+    poses = []
+    for one in _runs(archive, estimates, truth, there):
+        steps_of_run = (one.run, slice(len(one.t)))
+        rows = np.flatnonzero(there[steps_of_run])
+        place = one.place.at(rows).__getitem__
+        P = np.full((len(one.t), n, n), np.nan)
+        P[rows] = symmetric(covariances[one.run, rows], place)
+        T = None
+        if of_truth is not None:
+            T = symmetric(of_truth[one.run, rows], place)
+        of_steps = {"nis": nis, "nis_dof": dof, "cross": cross, "by": by}
+        own: dict[str, Any] = {key: at(values, steps_of_run) for key, values in of_steps.items()}
+        stated = np.ones(len(P), bool)
+        manifold = manifold_of(convention)
+        own |= {"covariance": P, "stated": stated, "true_covariance": T, "manifold": manifold, "convention": convention}
+        poses.append(replace(one, **own))
+    axes = archive.axes(n)
+    gap = np.where(there[..., None], truth - estimates, np.nan)
+    causes = swapped(path.stem, gap)
+    if convention == "vector":
+        remedy = "wrap it to [-pi, pi]"
+        if declared and n == 3:
+            remedy = "add --error so2, if these are x, y, heading"
+        causes += turns(path.stem, axes, gap, covariances, remedy)
+    if r.relative is not None:  # poses, or motions of them
+        axes = PLANAR_POSE
+    definition = PLANAR.get(declared, "")
+    return Estimator(path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps))
+
+
+def _kind(archive: Archive, r: Reading) -> tuple[str, ...]:
+    """The keys that an archive holds.
+
+    Raises
+    ------
+    InputError
+        It holds none of the kinds, another key beside one, or an option does not go with it.
+    """
+    path = archive.path
+    keys = set(archive.arrays)
+    kind = next((needed for needed in (OF_ERRORS, OF_POSES, OF_NEES) if set(needed) <= keys), None)
+    if kind is None:
+        raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(keys)) or 'nothing'}")
+    unknown = sorted(keys - set(kind) - OPTIONAL)
+    if unknown and r.by is None:
+        raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
+    if r.error is not None and kind != OF_POSES:
+        raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
+    if r.relative is not None and kind != OF_POSES:
+        raise InputError(f"{path}: --relative needs the keys {', '.join(OF_POSES)}, of poses or motions")
+    return kind
+
+
+def _convention(archive: Archive, r: Reading, n: int) -> str:
+    """The error of estimates of n components; "vector" unless another is declared, "so2" of motions over windows."""
+    convention = r.error or ("vector" if r.relative is None else "so2")
+    if r.error is not None and (convention not in PLANAR or (convention != "vector" and n != 3)):
+        raise InputError(f"--error {convention}: here it is 'vector', or so2, left or right for x, y, heading")
+    if r.relative is not None and (n != 3 or convention == "vector"):
+        raise InputError(f"{archive.path}: --relative needs poses x, y, heading, with --error so2, left or right")
+    return convention
+
+
+def _finite_truth(path: Path, estimates: Array, truth: Array, known: Array) -> Array:
+    """The truth, 0 where it is not finite beside a broken estimate.
+
+    Raises
+    ------
+    InputError
+        It is not finite beside an estimate that is.
+    """
+    finite: Array = np.asarray(np.isfinite(truth).all(axis=-1))
+    bad = known & np.isfinite(estimates).all(axis=-1) & ~finite
+    if bad.any():
+        run, step = np.argwhere(bad)[0]
+        where = f"{path}: key 'truth', run {run}, step {step + 1}"
+        raise InputError(f"{where}: not finite; 'mask' is true where there is none")
+    return truth if finite.all() else np.where(finite[..., None], truth, 0.0)
+
+
+def _poses_of_arrays(archive: Archive) -> Estimator:
+    """Planar poses of an archive with the keys ``estimates`` and ``truth``."""
+    path = archive.path
+    for key in ("estimates", "truth"):
+        if key not in archive:
+            raise InputError(f"{path}: key '{key}' is missing; needs estimates and truth, (runs, steps, 3)")
+    estimates, truth = archive.estimates_and_truth()
+    runs, steps, n = estimates.shape
+    if n != 3:
+        raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
+    there = archive.known(runs, steps) & np.isfinite(truth).all(axis=-1)
+    poses = list(_runs(archive, estimates, truth, there))
+    return Estimator(path.stem, path, poses, PLANAR_POSE, t=archive.times(steps))
+
+
+def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Iterator[Poses]:
+    """Estimates (runs, steps, n) and their truth where it is ``there``, without covariances, in the plane."""
+    path = archive.path
+    runs, steps, n = estimates.shape
+    clock = archive.times(steps)
+    for run, length in enumerate(archive.lengths(runs, steps)):
+        t = np.arange(float(length))
+        covariance, stated = unstated(length, n)
+        beside = Poses(
+            place=steps_of(path, run, np.arange(length)),
+            t=t,
+            estimate=estimates[run, :length],
+            covariance=covariance,
+            stated=stated,
+            true_t=t,
+            truth=truth[run, :length],
+            manifold="planar",
+            convention="left",
+            max_dt=0.0,
+            run=run,
+            name=path.stem if runs == 1 else f"run {run}",
+            files=(path, path),
+            numbered=True,
+            clock=clock[:length],
+        )
+        known = there[run, :length]
+        yield beside if known.all() else beside.beside(np.flatnonzero(known))
+
+
+def _of_nees(archive: Archive) -> Record:
+    """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
+    path = archive.path
+    nees = archive.array("nees", 2).copy()
+    dof = archive.whole_numbers("dof", nees.shape)
+    if not (are_dof(dof) & (dof >= 1)).all():
+        what = "one whole number of 1 or more, the dimension of the error, or one for each step"
+        raise InputError(f"{path}: key 'dof' must be {what}")
+    for run, step in np.argwhere(nees < 0):
+        raise InputError(f"{path}: key 'nees', run {run}, step {step + 1}: {nees[run, step]:g} is negative")
+    runs, steps = nees.shape
+    n = int(dof.min())
+    by_step = BY_STEP if (dof != dof[0, 0]).any() else {}
+    nees *= n / dof
+    nis, nis_dof = archive.nis((runs, steps))
+    known = archive.known(runs, steps)
+    failures = []
+    nees[~known] = np.nan
+    for run in range(runs):
+        finite = np.isfinite(nees[run])
+        begun = np.logical_or.accumulate(finite) | ~finite.any()
+        broken = np.flatnonzero(begun & known[run] & ~finite)
+        if len(broken):
+            step = int(broken[0])
+            nees[run, step:] = np.nan
+            failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
+    return Record(
+        path.stem,
+        nees=nees,
+        dof=n,
+        nis=nis,
+        nis_dof=nis_dof,
+        failures=tuple(failures),
+        axes=archive.axes(n),
+        runs=np.arange(runs),
+        t=archive.times(steps),
+        **by_step,
+    )
+
+
+def load_arrays(path: Path, keys: str = KINDS) -> dict[str, Array]:
+    """All arrays of an archive by key, of any shape; ``keys`` says in messages which it should hold.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or not an archive of arrays.
+    """
+    if not is_file(path):
+        raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
+    if path.suffix.lower() == ".mat":
+        return load_matlab(path)
+    with path.open("rb") as file:
+        what = "damaged or cut short" if file.read(2) == b"PK" else "or holds Python objects"
+    refusal = f"is not a NumPy archive, {what}; write it with numpy.savez"
+    with reading(path, refusal):
+        loaded = np.load(path, allow_pickle=False)
+    if not hasattr(loaded, "files"):
+        raise InputError(f"{path}: is a single array; save with numpy.savez and the keys {keys}")
+    with reading(path, refusal), loaded as archive:
+        if len(set(archive.files)) < len(archive.files):
+            raise ValueError("a key is duplicated")
+        require_room(path, sum(member.file_size for member in archive.zip.infolist()))
+        return {key: _member(path, archive, key) for key in archive.files}
+
+
+def _member(path: Path, archive: Any, key: str) -> Array:
+    try:
+        array: Array = archive[key]
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        what = "holds Python objects, as of runs of different lengths; pad them with NaN and add 'lengths'"
+        raise InputError(f"{path}: key '{key}' {what}") from None
+    return array
+
+
+# --- arrays by key, checked --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Arrays by key; its methods give them checked, and raise :class:`InputError`."""
+
+    path: Path
+    arrays: Mapping[str, Array]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.arrays
+
+    def require_numbers(self, key: str) -> Array:
+        """An array of numbers, of any shape."""
+        array = self.arrays[key]
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{self.path}: key '{key}' holds {array.dtype}, not numbers")
+        return array
+
+    def array(self, key: str, dimensions: int) -> Array:
+        """An array of floats; one run without its dimension gets it."""
+        array = self.require_numbers(key)
+        if array.ndim == dimensions - 1:
+            array = array[None]
+        if array.ndim != dimensions or not array.size:
+            needed = ", ".join(("runs", "steps", "n", "n")[:dimensions])
+            raise InputError(f"{self.path}: key '{key}' has shape {array.shape}, needs ({needed})")
+        return bounded(np.asarray(array, float))
+
+    def matrices(self, key: str, shape: tuple[int, ...]) -> Array:
+        """Matrices of one ``shape``, (runs, steps, n, n)."""
+        matrices = self.array(key, 4)
+        if matrices.shape != shape:
+            turned = _turned(matrices.shape, shape)
+            raise InputError(f"{self.path}: key '{key}' has shape {matrices.shape}, needs {shape}{turned}")
+        return matrices
+
+    def estimates_and_truth(self) -> tuple[Array, Array]:
+        """Both (runs, steps, n)."""
+        estimates = self.array("estimates", 3)
+        truth = self.array("truth", 3)
+        if estimates.shape != truth.shape:
+            turned = _turned(truth.shape, estimates.shape)
+            shapes = f"key 'truth' has shape {truth.shape}, 'estimates' {estimates.shape}"
+            raise InputError(f"{self.path}: {shapes}{turned}")
+        return estimates, truth
+
+    def whole_numbers(self, key: str, shape: tuple[int, ...]) -> Array:
+        """Numbers of one key, as many as ``shape``, or one for all."""
+        array = self.require_numbers(key)
+        try:
+            return np.broadcast_to(bounded(np.asarray(array, float)), shape)
+        except ValueError:
+            raise InputError(f"{self.path}: key '{key}' must be one number or of shape {shape}") from None
+
+    def lengths(self, runs: int, steps: int) -> list[int]:
+        """Steps of each run; those of the array ``lengths`` (runs,) where they differ."""
+        if "lengths" not in self:
+            return [steps] * runs
+        lengths = np.atleast_1d(self.arrays["lengths"])
+        are_whole = lengths.shape == (runs,) and lengths.dtype.kind in "iu"
+        if not are_whole or lengths.min() < 1 or lengths.max() > steps:
+            raise InputError(f"{self.path}: key 'lengths' must be {runs} whole numbers from 1 to {steps}")
+        return [int(length) for length in lengths]
+
+    def known(self, runs: int, steps: int) -> Array:
+        """Steps that belong to each run and have a truth, (runs, steps) of bool."""
+        known = np.arange(steps) < np.array(self.lengths(runs, steps))[:, None]
+        mask = self.arrays.get("mask", np.zeros((runs, steps), bool))
+        if mask.shape != (runs, steps) or mask.dtype.kind != "b":
+            raise InputError(f"{self.path}: key 'mask' must be truth values of shape {(runs, steps)}")
+        return np.asarray(known & ~mask)
+
+    def nis(self, shape: tuple[int, int]) -> tuple[Array | None, Array | None]:
+        """NIS and its degrees of freedom, (runs, steps); None without any."""
+        if "nis" not in self:
+            return None, None
+        if "nis_dof" not in self:
+            raise InputError(f"{self.path}: key 'nis_dof' is missing; {NIS_DOF}")
+        nis = self.array("nis", 2)
+        if nis.shape != shape:
+            raise InputError(f"{self.path}: key 'nis' has shape {nis.shape}, needs {shape}")
+        dof = np.where(np.isnan(nis), 0.0, self.whole_numbers("nis_dof", shape))
+        steps = shape[1]
+
+        def place(k: int) -> str:
+            return f"{self.path}, run {k // steps}, step {k % steps + 1}"
+
+        return nis, checked_dof(nis.ravel(), dof.ravel(), place).reshape(shape)
+
+    def times(self, steps: int) -> Array:
+        """Key ``t``, (steps,) in s; NaN without it."""
+        if "t" not in self:
+            return np.full(steps, np.nan)
+        t = self.arrays["t"]
+        are_numbers = t.shape == (steps,) and t.dtype.kind in "fiu"
+        if not are_numbers or not (np.diff(t) > 0).all():
+            raise InputError(f"{self.path}: key 't' must be {steps} increasing numbers, in s")
+        return np.asarray(t, float)
+
+    def axes(self, n: int) -> tuple[str, ...]:
+        """Names of the n components of the error."""
+        if "axes" not in self:
+            return numbered_axes(n)
+        where = f"{self.path}: key 'axes'"
+        axes = tuple(require_name(str(axis), where) for axis in np.atleast_1d(self.arrays["axes"]))
+        if len(axes) != n:
+            raise InputError(f"{where} names {len(axes)} components, the error has {n}")
+        return axes
+
+    def groups(self, r: Reading, shape: tuple[int, ...]) -> Array | None:
+        """Cells of the key of ``--by``, (runs, steps); a value for each run stands in all of its steps."""
+        if r.by is None or r.by_file is not None:
+            return None
+        if r.by not in self:
+            there = ", ".join(sorted(self.arrays))
+            raise InputError(f"--by {r.by}: {self.path} has no such key; it holds {there}")
+        try:
+            return on_steps(self.arrays[r.by], shape)
+        except ValueError as error:
+            raise InputError(f"{self.path}: key '{r.by}' {error}") from None
+
+
+def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:
+    """What to say where two shapes differ by the order of runs and steps alone."""
+    if found != (needed[1], needed[0], *needed[2:]):
+        return ""
+    return "; runs and steps are swapped in one: the order is (runs, steps, ...), so transpose its first two axes"
+
+
+def require_layout(key: str, e: tuple[int, ...], P: tuple[int, ...], where: str = "") -> None:
+    """Refuse errors or estimates of shape ``e`` beside covariances of shape ``P`` in the layout of another program.
+
+    Raises
+    ------
+    InputError
+        Components come first, a state is a column, or matrices are variances, rows of numbers, or one for all.
+    """
+    if len(e) < 2 or (*e, e[-1]) == P:
+        return
+    n = e[-1]
+    full = (*e, n)
+    remedy = ""
+    if (e[0], *e) == P and len(P) > 2:
+        remedy = f"components come first: np.moveaxis({key}, 0, -1) and np.moveaxis(covariances, (0, 1), (-2, -1)) " \
+                 "put them behind runs and steps"  # fmt: skip
+    elif n == 1 and (*e[:-1], e[-2]) == P:
+        remedy = f"a state is a column, (n, 1): take {key}[..., 0]"
+    elif n > 1 and (*e[:-1], n * n) == P:
+        remedy = f"each matrix is a row of {n * n} numbers: covariances.reshape({full})"
+    elif e == P:
+        remedy = f"variances are covariances[..., None] * np.eye({n})"
+        remedy += "" if where else ", standard deviations go into deviations="
+    elif len(e) == 3 and e[0] > 1 and P in (full[1:], full[2:]):
+        remedy = f"one for all is np.broadcast_to(covariances, {full})"
+    if remedy:
+        raise InputError(f"{where}{key} has shape {e} and covariances {P}; needed are (runs, steps, n) and "
+                         f"(runs, steps, n, n); {remedy}")  # fmt: skip
+
+
+def swapped(name: str, errors: Array) -> list[str]:
+    """A hint where errors (runs, steps, n) correlate from run to run, and not from step to step; none elsewhere."""
+    runs, steps, _ = errors.shape
+    if runs < FEWEST or steps < FEWEST or runs * steps < ENOUGH:
+        return []
+    e = np.where(np.isfinite(errors), errors, 0.0)
+    of_runs, of_steps = (_lag(e - e.mean(axis=axis, keepdims=True), axis) for axis in (0, 1))
+    if of_runs < ALIKE or abs(of_steps) > UNLIKE * of_runs:
+        return []
+    return [
+        f"{name}: errors correlate by {of_runs:.2f} from one run to the next and by {of_steps:.2f} from one step to "
+        "the next, as in arrays (steps, runs, n); the order is (runs, steps, n): np.swapaxes(array, 0, 1) of each"
+    ]
+
+
+def _lag(e: Array, axis: int) -> float:
+    """Mean correlation of errors (runs, steps, n) with their neighbours along an axis, over components."""
+    e = np.moveaxis(e, axis, 0)
+    size = np.square(e).mean(axis=(0, 1))
+    together = (e[1:] * e[:-1]).mean(axis=(0, 1))
+    return float(np.mean(together / np.where(size > 0, size, 1.0)))
+
+
+def load_matlab(path: Path) -> dict[str, Array]:
+    """Arrays by name. MATLAB drops a last dimension of 1, which a single component has: it is restored."""
+    from scipy.io import loadmat, whosmat
+
+    with reading(path), path.open("rb") as file:
+        if file.read(len(HDF5)) == HDF5:
+            raise InputError(f"{path}: is of MATLAB 7.3; write it with save(..., '-v7')")
+    with reading(path):
+        sizes = [int(np.prod(shape, dtype=float)) for _, shape, _ in whosmat(path)]
+        require_room(path, 8 * sum(sizes))
+        arrays = {}
+        for key, value in loadmat(path).items():
+            if not key.startswith("__"):
+                arrays[key] = _array(key, value)
+    P = arrays.get("covariances")
+    if P is None or P.ndim > 2:
+        return arrays
+    if P.shape[1] == 1:
+        raise InputError(f"{path}: key 'covariances' has shape {P.shape}: one run of one component has (1, steps)")
+    arrays["covariances"] = P[..., None, None]
+    for key in {"errors", "estimates", "truth"} & set(arrays):
+        arrays[key] = arrays[key][..., None]
+    return arrays
+
+
+def _array(key: str, value: object) -> Array:
+    """An array of a key; MATLAB has no fewer than two dimensions, no truth values, and texts in a cell."""
+    array = np.asarray(value)
+    if key in ("t", "lengths"):
+        return array.ravel()
+    if key == "dof":
+        return array.squeeze()
+    if key == "mask":
+        return np.asarray(array != 0)
+    if key == "axes":
+        return np.array([str(np.squeeze(each)) for each in array.ravel()])
+    return array
+
+
+def extended_errors(path: Path, arrays: Mapping[str, Array], convention: str | None) -> tuple[dict[str, Array], str]:
+    """The arrays with ``errors`` (runs, steps, 9 or 15) and ``axes`` in place of the states, and the error in words.
+
+    Parameters
+    ----------
+    arrays : R (runs, steps, 3, 3), from body to world, p and v (runs, steps, 3), in the world, m and m/s; bg and ba
+        (runs, steps, 3), rad/s and m/s^2, both or none; the same of the truth as true_R and so on; ``order``, names of
+        the parts as they stand in the covariance, R, p, v, bg, ba by default; one run may lack the first dimension
+    convention : ``left`` is Log(est^-1 truth) of SE2(3), ``right`` Log(truth est^-1), ``additive`` a difference;
+        ``so3`` and ``so3-body`` are additive but for the rotation
+        (:func:`consistency.referee.geometry.state_error`). Biases are differences.
+
+    Raises
+    ------
+    InputError
+        A part is missing or of another shape, no rotation, or the truth is not finite; or no error is declared.
+    """
+    if convention not in INERTIAL:
+        raise InputError(
+            f"{path}: holds states of R, p and v, whose error is not known; add --error {', '.join(INERTIAL)}: left or "
+            "right of SE2(3), or differences, the rotation's about axes of the world or of the body or of its vector"
+        )
+    parts = [part for part in AXES if part in arrays]
+    order = _order(path, arrays, parts)
+    own = {}
+    true = {}
+    for part in parts:
+        own[part] = _part(path, arrays, part)
+        true[part] = _part(path, arrays, TRUE + part)
+        shape = own[part].shape
+        if shape != true[part].shape or shape[:2] != own["R"].shape[:2]:
+            shapes = f"{shape} and {true[part].shape}, beside R {own['R'].shape}"
+            raise InputError(f"{path}: keys '{part}' and '{TRUE}{part}' have shapes {shapes}")
+        if not np.isfinite(true[part]).all():
+            raise InputError(f"{path}: key '{TRUE}{part}' is not finite; leave such steps out")
+    states = list(STATE[: len(parts)])
+    estimate = _states(path, own, states, "")
+    truth = _states(path, true, states, TRUE)
+    finite = np.isfinite(estimate).all(axis=-1)
+    error = np.full((*finite.shape, 3 * len(states)), np.nan)
+    error[finite] = state_error(truth[finite], estimate[finite], convention)
+    places = [3 * states.index(part) + i for part in order for i in range(3)]
+    rest = {}
+    for key, array in arrays.items():
+        if key.removeprefix(TRUE) not in (*AXES, "order"):
+            rest[key] = array
+    rest["errors"] = error[..., places]
+    rest["axes"] = np.array([AXES[part] for part in order]).ravel()
+    of = "and the difference of the velocity"
+    if convention in ("left", "right"):
+        of = "with the velocity, of SE2(3)"
+    return rest, f"{INERTIAL[convention]}, {of}; in the order {', '.join(order)}"
+
+
+def _order(path: Path, arrays: Mapping[str, Array], parts: list[str]) -> list[str]:
+    """The parts as they stand in the covariance; refused where a part is missing."""
+    for bias, other in (("bg", "ba"), ("ba", "bg")):
+        if bias in parts and other not in parts:
+            raise InputError(f"{path}: key '{other}' is missing; there are two biases or none")
+    for part in parts:
+        if TRUE + part not in arrays:
+            raise InputError(f"{path}: key '{TRUE}{part}' is missing, of the true states")
+    order = list(map(str, np.atleast_1d(arrays.get("order", np.array(parts)))))
+    if sorted(order) != sorted(parts):
+        raise InputError(f"{path}: key 'order' is {', '.join(order)}; must name {', '.join(parts)}, each once")
+    return order
+
+
+def _part(path: Path, arrays: Mapping[str, Array], key: str) -> Array:
+    """A part of all states, (runs, steps, 3) or (runs, steps, 3, 3)."""
+    tail = (3, 3) if key.endswith("R") else (3,)
+    array = np.asarray(arrays[key], float)
+    lead = array.ndim - len(tail)
+    if array.shape[-len(tail) :] != tail or lead not in (1, 2):
+        wanted = ", ".join(map(str, tail))
+        raise InputError(f"{path}: key '{key}' has shape {array.shape}, needs (runs, steps, {wanted})")
+    return array if lead == 2 else array[None]
+
+
+def _states(path: Path, parts: Mapping[str, Array], order: list[str], prefix: str) -> Array:
+    """States (runs, steps, 4 + 3 k) with quaternions; NaN where a rotation is not finite."""
+    R = parts["R"]
+    finite = np.isfinite(R).all(axis=(-2, -1))
+    if not are_rotations(R[finite]).all():
+        raise InputError(f"{path}: key '{prefix}R' holds a matrix that is not a rotation")
+    columns = {**parts, "R": quaternions(R)}
+    return np.concatenate(list(map(columns.__getitem__, order)), axis=-1)

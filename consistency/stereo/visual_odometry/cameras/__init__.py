@@ -1,1 +1,0 @@
-"""Calibrated cameras and the files that they are read from."""

@@ -17,7 +17,7 @@ import consistency.bench.filters
 
 PACKAGE = Path(consistency.__file__).parent
 PAGE = "docs/extending.md"
-EFFECTS = Path("consistency/bench/scenario/effects")
+EFFECTS = Path("consistency/bench/scenario")
 
 
 def code(heading):
@@ -82,7 +82,7 @@ def test_the_question_of_the_document_is_asked(copy):
     statistic, (table, line) = example("trend.py"), code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
     (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
-    tests = folder / "judging/hypothesis_tests.py"
+    tests = folder / "judging/error_parts.py"
     first = "    distribution = pit(sample.nees, sample.dof)\n"
     changed(tests, first, f"    {line.strip()}\n{first}")
     changed(tests, "\n\n@dataclass(frozen=True)\nclass Tests", f"\n{table}\n\n@dataclass(frozen=True)\nclass Tests")
@@ -164,7 +164,7 @@ def test_the_bias_of_the_document_works(copy):
     effect, test, (line, key) = example("bias.py"), example("check_bias.py"), code("Add a sensor effect")
     assert line.count("\n") == 1
     (copy / EFFECTS / "bias.py").write_text(effect, encoding="utf-8")
-    names, first = copy / EFFECTS / "__init__.py", "from consistency.bench.scenario.observations"
+    names, first = copy / EFFECTS / "effects.py", "from consistency.bench.scenario.observations"
     changed(names, first, line + first)
     scenario = (copy / "scenarios" / "herath2007-stereo.toml").read_text(encoding="utf-8")
     (copy / "mine.toml").write_text(f"{scenario}\n{key}", encoding="utf-8")

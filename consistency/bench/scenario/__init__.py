@@ -1,8 +1,8 @@
 """Scenarios: a TOML file becomes a frozen record of what is true and what the filter believes.
 
-``toml_tables`` reads files, ``sensor_view`` and ``sensor`` have the one definition of a sensor, ``truth`` what is the
-case. ``truth_and_belief`` sets a belief beside it, and makes a file of both. ``effects`` holds what a sensor does to an
-ideal observation: the keys of each effect and its ``apply``. Nothing here draws a trial; that is the simulation's.
+``toml_tables`` reads files, ``sensor`` has the one definition of a sensor, ``truth_and_belief`` what is the case and
+the belief beside it, and makes a file of both. ``effects`` holds what a sensor does to ideal ``observations``: the keys
+of each effect and its ``apply``. Nothing here draws a trial; that is the simulation's.
 """
 
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias

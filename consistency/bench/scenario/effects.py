@@ -1,8 +1,6 @@
 """Effects of a sensor on an ideal observation, each with its keys in a scenario and its ``apply``.
 
-docs/extending.md shows how to add one.
-
-Those of ``built_in`` are in every sensor. The effects that a scenario may list are made known by the imports below;
+Field of view, noise and search range are in every sensor; the others are those that a scenario may list.
 docs/extending.md shows how to add one.
 """
 

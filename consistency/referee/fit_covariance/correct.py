@@ -138,7 +138,7 @@ class Correction:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.fit_files import draw_correction
+        from consistency.referee.fit_covariance.pictures import draw_correction
         from consistency.referee.pages.write_pages import plotted
 
         return plotted(partial(draw_correction, self), path)

@@ -140,6 +140,12 @@ class NoiseModel:
             steps = evenly(steps[0], PIECES)
         return np.asarray(self.noise.covariance(steps[None])[0])
 
+    def error_windows(self, judged: JudgedSpan) -> DriveWindows:
+        """The windows of a span, corrected."""
+        found = self.windows.over(span_of(judged.span).size)
+        assert found is not None
+        return self.noise.mean.applied(found)
+
     def plot(self, path: str | Path | None = None) -> Any:
         """Errors with ellipses, growth of the squared error over spans, and ratios by drive; needs ``[plot]``.
 
@@ -147,7 +153,7 @@ class NoiseModel:
         ----------
         path : .png, .pdf or .svg to write as well; one that is there is replaced
         """
-        from consistency.referee.fit_covariance.fit_files import draw_noise
+        from consistency.referee.fit_covariance.pictures import draw_noise
         from consistency.referee.pages.write_pages import plotted
 
         return plotted(partial(draw_noise, self), path)
@@ -325,13 +331,6 @@ def _judge_spans(
             f"longer drives: {DECIDE} windows, or {ENOUGH} drives, make a verdict possible"
         )
     return tuple(found)
-
-
-def error_windows(model: NoiseModel, judged: JudgedSpan) -> DriveWindows:
-    """The windows of a span, corrected."""
-    found = model.windows.over(span_of(judged.span).size)
-    assert found is not None
-    return model.noise.mean.applied(found)
 
 
 def model_sentence(model: NoiseModel) -> str:

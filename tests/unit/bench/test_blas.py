@@ -83,11 +83,11 @@ def test_rows_of_half_a_covariance(rng):
 
 KERNEL = """
 import numpy as np
-from consistency.bench.filters.kernel import blas
+from consistency.bench.filters.kernel import linalg
 from consistency.bench.filters.compiler.jit import Kernel
 
 def root_of(A):
-    return blas.upper_cholesky(A)
+    return linalg.upper_cholesky(A)
 
 root = Kernel(root_of)
 

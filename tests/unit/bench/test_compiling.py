@@ -25,7 +25,7 @@ import multiprocessing, os, resource, signal, sys, time
 from pathlib import Path
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.runs import missing_kernels
+from consistency.bench.runs import run_outcome
 
 def total(values):
     result = 0.0
@@ -64,7 +64,7 @@ def case():
         os.setgid(65534)
         os.setuid(65534)
     try:
-        missing_kernels.compile_all(((f, None, None) for f in filters), int(jobs))
+        run_outcome.compile_all(((f, None, None) for f in filters), int(jobs))
     except KeyboardInterrupt:
         print("stopped")
     else:

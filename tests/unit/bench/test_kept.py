@@ -2,13 +2,10 @@
 
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from consistency.bench.filters.compiler import jit
-from consistency.bench.filters.compiler import jit as disk_cache
-from consistency.bench.filters.compiler import jit as whole_program
 
 
 def total(n):
@@ -22,7 +19,7 @@ def total(n):
 def cache(tmp_path, monkeypatch):
     """Where kernels of this test are kept."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    disk_cache._say.cache_clear()
+    jit._say.cache_clear()
     return tmp_path / "cache"
 
 
@@ -36,7 +33,7 @@ def use():
 
 
 def code_in(cache):
-    (path,) = cache.rglob(f"*{disk_cache.SUFFIX}")
+    (path,) = cache.rglob(f"*{jit.SUFFIX}")
     return path
 
 
@@ -98,25 +95,25 @@ def test_code_that_cannot_be_kept_serves_its_process(cache, monkeypatch, capsys)
 
     monkeypatch.setattr(Path, "replace", full)
     assert use() == (False, 0)
-    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{disk_cache.SUFFIX}"))
+    assert not list(cache.rglob(".*")) + list(cache.rglob(f"*{jit.SUFFIX}"))
     assert capsys.readouterr().err.count("No space left on device; compiled code is not kept") == 1
 
 
 def test_what_was_not_used_for_longest_is_removed_first(tmp_path):
     for age, name in enumerate("abcd"):
-        path = tmp_path / f"{name}{disk_cache.SUFFIX}"
+        path = tmp_path / f"{name}{jit.SUFFIX}"
         path.write_bytes(bytes(100))
         os.utime(path, (1e9 - age, 1e9 - age))
     unfinished, stale = tmp_path / ".new", tmp_path / ".old"
     for path, time in ((unfinished, 1e9), (stale, 1e9 - 2e5)):
         path.write_bytes(b"")
         os.utime(path, (time, time))
-    disk_cache.prune(tmp_path, most=250)
+    jit.prune(tmp_path, most=250)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".new", "a.kernel", "b.kernel"]
 
 
 def test_an_untried_numba_compiles_as_it_does(cache, monkeypatch):
-    monkeypatch.setattr(whole_program, "numba", SimpleNamespace(__version__="99.1"))
-    assert not whole_program.is_supported()
+    monkeypatch.setattr(jit.numba, "__version__", "99.1")
+    assert not jit.is_supported()
     assert use() == (False, 0)
     assert use() == (True, 1)

@@ -46,7 +46,7 @@ AT_A_TIME = 1000  # batches of an executor that does not say how many it should 
 SECONDS = 1.5  # after which a batch comes back with what is done of it, where the executor does not say
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on
 # and our own sources
-ROOMS = ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters")
+ROOMS = ("referee/geometry.py", "bench/models", "bench/scenario", "bench/simulation", "bench/filters")
 
 
 def worker_count(jobs: int) -> int:
@@ -382,8 +382,10 @@ def do_batch(pickled: bytes, runs: Sequence[int], seconds: float, number: int) -
 def versions_here() -> dict[str, str]:
     """What a worker must have in common with the process that it works for."""
     digest = hashlib.sha256()
-    for path in sorted(path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")):
-        digest.update(path.read_bytes())
+    for room in ROOMS:
+        place = PACKAGE / room
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(path.read_bytes())
     package_version = f"{version('filter-consistency')} (sources {digest.hexdigest()[:12]})"
     python = ".".join(platform.python_version_tuple()[:2])  # classes from __main__ are sent as its bytecode
     return {"filter-consistency": package_version, "Python": python} | {name: version(name) for name in DECIDING}

@@ -192,3 +192,11 @@ def test_every_public_name_is_there():
         assert getattr(consistency, name) is not None
     with pytest.raises(AttributeError, match="consistency attribute nonsense"):
         _ = consistency.nonsense
+
+
+def test_lists_of_sources_name_what_is_there():
+    """A digest over a place that is gone would never change."""
+    from consistency.bench.runs.workers import PACKAGE, ROOMS
+    from consistency.bench.sweeps.run_sweep import CODE
+
+    assert [place for place in (*ROOMS, *CODE) if not (PACKAGE / place).exists()] == []

@@ -65,18 +65,33 @@ def test_a_direction_that_is_turned_is_reported(tmp_path):
     assert "turned BROKEN" in done.stdout
 
 
-def test_no_two_modules_import_each_other():
-    """Wherever in them, for the type checker too; but a fit shows itself by the modules that show it."""
-    modules = grimp.build_graph("consistency", cache_dir=None)
-    graph = {name: modules.find_modules_directly_imported_by(name) for name in modules.modules}
-    fitting = "consistency.referee.fit_covariance"
-    graph[f"{fitting}.noise_model"] -= {f"{fitting}.page", f"{fitting}.model_text"}
-    graph[f"{fitting}.correct"] -= {f"{fitting}.page", f"{fitting}.correction_text"}
+def imports_of(package):
+    """What each module of a package imports from it: on top, within functions, and for the type checker."""
+    modules = grimp.build_graph(package, cache_dir=None)
+    return {name: modules.find_modules_directly_imported_by(name) for name in modules.modules}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    graph = imports_of("consistency")
     assert len(graph) > 250
     assert acyclic(graph)
     assert not acyclic(
         graph | {"consistency.bench.scenario.toml_tables": {"consistency.bench.scenario.observations"}}
     )  # negative control
+
+
+@pytest.mark.parametrize("condition", ["def later():", "if TYPE_CHECKING:"])
+def test_a_circle_by_an_import_below_the_top_is_seen(tmp_path, monkeypatch, condition):
+    package = tmp_path / "circle"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "first.py").write_text("import circle.second")
+    second = package / "second.py"
+    second.write_text("from typing import TYPE_CHECKING")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert acyclic(imports_of("circle"))
+    second.write_text(f"from typing import TYPE_CHECKING\n{condition}\n    from circle.first import name")
+    assert not acyclic(imports_of("circle"))
 
 
 def test_the_page_of_the_house_has_its_table():

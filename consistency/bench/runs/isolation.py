@@ -37,6 +37,11 @@ from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.system.stopping import link_to_parent
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 KILLED = (-signal.SIGTERM, -getattr(signal, "SIGKILL", signal.SIGTERM))  # exit codes; no filter ends itself so
 GLANCE = 0.5  # s between looks at whether a process still lives
 LOADING = 60.0  # s that loading a filter may take where there is a time-out
@@ -328,12 +333,6 @@ def dismiss() -> None:
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_idle.clear)
     os.register_at_fork(after_in_child=_starter.cache_clear)  # no thread is there after a fork
-
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

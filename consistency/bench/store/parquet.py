@@ -245,8 +245,6 @@ def are_no_numbers(cells: pd.Series[Any]) -> Array:
 
 def check_column(path: Path, column: pd.Series[Any], kind: str, first: int = 0) -> None:
     """Refuse what is not a number; ``first`` is the row of the file that the column begins with."""
-    import pandas as pd
-
     with reading(path, f"column '{column.name}' cannot be read as numbers"):
         if column.dtype.kind == "c" or are_no_numbers(column).any():
             raise ValueError(column.dtype)

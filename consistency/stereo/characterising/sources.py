@@ -1,7 +1,4 @@
-"""What is characterised, a log, stereo pairs in the order of time or of a chessboard.
-
-What can be estimated from each.
-"""
+"""What is characterised: a log, stereo pairs in the order of time or of a chessboard; what each lets be estimated."""
 
 from __future__ import annotations
 
@@ -50,6 +47,36 @@ CHOSEN = (
 )
 
 
+@dataclass(frozen=True)
+class SourceOptions:
+    """What is known of a source beside its files."""
+
+    grid: tuple[int, int] | None = None
+    at_rest: bool = False
+    free_poses: bool = False
+    calibration: Path | None = None
+    truth: Path | None = None
+    format: str | None = None
+    left: str | None = None
+    right: str | None = None
+    board: tuple[int, int] | None = None  # inner corners across and down
+    square: float | None = None  # m
+    distortion: str | None = None
+    seed: int | None = None
+
+    def of_images(self) -> list[str]:
+        """Options that are given and mean nothing for a log."""
+        both = ("grid", "at_rest", "free_poses")
+        return [f"--{name}" for name, value in vars(self).items() if name not in both and value is not None]
+
+
+class MeasuredSensor(NamedTuple):
+    """A characterisation and what of the source's file stays as it was."""
+
+    of: Characterisation
+    others: Mapping[str, Any]  # tables of sensor.toml beside the sensor itself
+
+
 def characterise_source(source: Path, options: SourceOptions) -> MeasuredSensor:
     """The sensor of a log folder or of a folder of images.
 
@@ -84,7 +111,6 @@ def characterise_source(source: Path, options: SourceOptions) -> MeasuredSensor:
 
 
 def _of_sequence(source: Path, options: SourceOptions) -> MeasuredSensor:
-
     if options.distortion is not None:
         raise InputError("--distortion: goes with --board; other images bring their calibration")
     if options.grid is not None:
@@ -105,36 +131,6 @@ def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
     if not cross or not are_numbers or min(int(one), int(two)) < least:
         raise InputError(f"{option} {text}: must be two numbers of at least {least}, as 9x6")
     return int(one), int(two)
-
-
-@dataclass(frozen=True)
-class SourceOptions:
-    """What is known of a source beside its files."""
-
-    grid: tuple[int, int] | None = None
-    at_rest: bool = False
-    free_poses: bool = False
-    calibration: Path | None = None
-    truth: Path | None = None
-    format: str | None = None
-    left: str | None = None
-    right: str | None = None
-    board: tuple[int, int] | None = None  # inner corners across and down
-    square: float | None = None  # m
-    distortion: str | None = None
-    seed: int | None = None
-
-    def of_images(self) -> list[str]:
-        """Options that are given and mean nothing for a log."""
-        both = ("grid", "at_rest", "free_poses")
-        return [f"--{name}" for name, value in vars(self).items() if name not in both and value is not None]
-
-
-class MeasuredSensor(NamedTuple):
-    """A characterisation and what of the source's file stays as it was."""
-
-    of: Characterisation
-    others: Mapping[str, Any]  # tables of sensor.toml beside the sensor itself
 
 
 def is_log(folder: Path) -> bool:

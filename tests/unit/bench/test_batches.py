@@ -203,8 +203,13 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monke
     assert Path(cs.__file__).parent == workers.PACKAGE
     assert workers.versions_here()["Python"] == f"{sys.version_info.major}.{sys.version_info.minor}"
     monkeypatch.setattr(workers, "PACKAGE", tmp_path)
-    seen = [own()]
-    for room in ("referee/geometry", "bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
+    errors_of_poses = tmp_path / "referee" / "geometry.py"
+    errors_of_poses.parent.mkdir()
+    seen = []
+    for text in ("x = 1", "x = 2"):
+        errors_of_poses.write_text(text)
+        seen.append(own())
+    for room in ("bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
         (tmp_path / room / "inner").mkdir(parents=True)
         (tmp_path / room / "inner" / "source.py").write_text(f"x = '{room}'")
         seen.append(own())

@@ -205,12 +205,14 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monke
     monkeypatch.setattr(workers, "PACKAGE", tmp_path)
     errors_of_poses = tmp_path / "referee" / "geometry.py"
     errors_of_poses.parent.mkdir()
+    rooms = ("bench/models", "bench/scenario", "bench/simulation", "bench/filters")
+    for room in rooms:
+        (tmp_path / room / "inner").mkdir(parents=True)
     seen = []
     for text in ("x = 1", "x = 2"):
         errors_of_poses.write_text(text)
         seen.append(own())
-    for room in ("bench/models", "bench/scenario", "bench/simulation", "bench/filters"):
-        (tmp_path / room / "inner").mkdir(parents=True)
+    for room in rooms:
         (tmp_path / room / "inner" / "source.py").write_text(f"x = '{room}'")
         seen.append(own())
     assert len(set(seen)) == len(seen)

@@ -3,8 +3,7 @@
 The NEES is e' P^-1 e, so it is right only if P is the covariance of this very e: same group, same side, same
 order of components. The sign of e does not matter to it.
 
-Filters of the bench and files of other estimators are judged by the errors that are defined here; those of poses in
-space are in :mod:`consistency.referee.geometry`.
+Filters of the bench and files of other estimators are judged by the errors that are defined here.
 
 d is 2 or 3, and n the dimension of the group, 3 or 6; a twist has its translation first.
 """
@@ -229,8 +228,7 @@ def adjoint(T: Array) -> Array:
 def to_left(T: Array, convention: str) -> Array:
     """J (N, n, n) with e_left = J e to first order, e the error of T (N, d + 1, d + 1) in a ``convention``.
 
-    The conventions are those of :mod:`consistency.referee.geometry`. T_true = T Exp(e_left), so that the
-    position is off by R rho and the rotation by phi about the axes of the body.
+    T_true = T Exp(e_left), so that the position is off by R rho and the rotation by phi about the axes of the body.
     """
     if convention == "right":
         return adjoint(inverse(T))
@@ -290,7 +288,7 @@ def spatial_error(truth: Array, estimate: Array, convention: str) -> Array:
     """Error of poses (x, y, z, qx, qy, qz, qw), shape (..., 7) -> (..., 6): translation, then rotation.
 
     The quaternion turns body into world coordinates (Hamilton, scalar last). ``left`` and ``right`` as in
-    :func:`consistency.referee.geometry.planar_error`. ``so3`` is the error of ROS messages
+    :func:`planar_error`. ``so3`` is the error of ROS messages
     (geometry_msgs/PoseWithCovariance: position, then rotations about fixed axes); ``so3-body`` is the local angular
     error of Solà (2017), "Quaternion kinematics for the error-state Kalman filter", beside the plain position.
     ``rvec`` and ``euler`` are differences of rotation vectors, and of roll, pitch, yaw.

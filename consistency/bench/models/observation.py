@@ -1,8 +1,7 @@
 """Points as sensors see them, with Jacobians: stereo and range and bearing, from a planar robot.
 
-Herath et al. (2007) eq. 19 to 22.
-
-Pixels are relative to the principal point: u grows to the right, v downwards, d is the disparity.
+The equations are 19, 21 and 22 of Herath, Kodagoda & Dissanayake (2007). Pixels are relative to the principal point: u
+grows to the right, v downwards, d is the disparity.
 """
 
 from __future__ import annotations

@@ -300,6 +300,3 @@ def plan_of(plan: dict[str, Any]) -> Design:
         return sequential_design(**plan)
     except ValueError as error:
         raise refused(error) from None
-
-
-# --- pilots: runs that tell how steps depend on each other, from which a number of runs is planned ----------------

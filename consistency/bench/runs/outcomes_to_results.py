@@ -1,6 +1,6 @@
 """From the outcomes of runs, as they come, to results.
 
-In rounds of more and more runs, resumed where a folder has some already.
+Runs come in rounds of more and more, and a study is resumed where a folder has some already.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What is done for a run and what comes of it.
 
-Kernels compiled before they are needed, NEES and NIS of its steps, failures.
+Kernels are compiled before they are needed. A run leaves NEES and NIS of its steps, or a failure.
 """
 
 from __future__ import annotations

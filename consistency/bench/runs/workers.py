@@ -5,7 +5,6 @@ Compiled filters release the GIL, other filters are waited for.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pickle
 import platform
@@ -32,7 +31,7 @@ from consistency.bench.filters.run_filter import RunRecord, reason_of
 from consistency.bench.runs.run_outcome import Outcomes, Recorded, RunOutcome, TrialWork, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import in_words, this_machine
+from consistency.referee.system.folders import digest_of_sources, in_words, this_machine
 from consistency.referee.system.progress import say
 
 CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container or a control group, "max" where there is none
@@ -381,12 +380,7 @@ def do_batch(pickled: bytes, runs: Sequence[int], seconds: float, number: int) -
 @cache
 def versions_here() -> dict[str, str]:
     """What a worker must have in common with the process that it works for."""
-    digest = hashlib.sha256()
-    for room in ROOMS:
-        place = PACKAGE / room
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(path.read_bytes())
-    package_version = f"{version('filter-consistency')} (sources {digest.hexdigest()[:12]})"
+    package_version = f"{version('filter-consistency')} (sources {digest_of_sources(PACKAGE, ROOMS)[:12]})"
     python = ".".join(platform.python_version_tuple()[:2])  # classes from __main__ are sent as its bytecode
     return {"filter-consistency": package_version, "Python": python} | {name: version(name) for name in DECIDING}
 

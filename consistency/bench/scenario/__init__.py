@@ -7,12 +7,7 @@ of each effect and its ``apply``. Nothing here draws a trial; that is the simula
 
 from consistency.bench.scenario.effects import BiasMap, DisparityGrowth, ListedEffect, LocalBias
 from consistency.bench.scenario.observations import PLANAR_SENSORS, Mount
-from consistency.bench.scenario.sensor import (
-    BelievedSensor,
-    PicturedSensor,
-    TrueSensor,
-    UvdSensor,
-)
+from consistency.bench.scenario.sensor import BelievedSensor, PicturedSensor, TrueSensor, UvdSensor
 from consistency.bench.scenario.toml_tables import Count, Finite, Positive, Table, explain, read_table
 from consistency.bench.scenario.truth_and_belief import (
     AnnularLandmarks,

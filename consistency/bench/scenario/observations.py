@@ -1,6 +1,6 @@
 """What effects of a sensor work on.
 
-The observations of a trial, what the sensor is and sees, tables over nodes, and what an effect is.
+These are the observations of a trial, what the sensor is and sees, and tables over nodes; and what an effect is.
 """
 
 from __future__ import annotations

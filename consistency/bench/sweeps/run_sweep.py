@@ -36,7 +36,7 @@ from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
-from consistency.referee.system.folders import manifest_of, read_manifest, unfinished_of
+from consistency.referee.system.folders import digest_of_sources, manifest_of, read_manifest, unfinished_of
 from consistency.referee.system.progress import quiet, say
 from consistency.referee.system.stopping import write_whole
 
@@ -141,12 +141,7 @@ def _time_left(seconds: float) -> str:
 @functools.cache
 def code_digest() -> str:
     """Hash of the sources that the numbers of a cell depend on."""
-    root, digest = Path(__file__).parents[2], hashlib.sha256()
-    for name in CODE:
-        place = root / name
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
+    return digest_of_sources(Path(__file__).parents[2], CODE)[:16]
 
 
 @dataclass(frozen=True)

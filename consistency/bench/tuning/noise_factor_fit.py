@@ -75,7 +75,7 @@ def fit_log_factors(score: Scoring, starts: Sequence[Array]) -> FactorFit | None
 
     The search is COBYQA (Ragonneau & Zhang 2025; SciPy), a trust region on quadratic models without derivatives, and
     one Newton step at its end. The score is smooth, for all settings see the same trials. Intervals are those of the
-    profile (:mod:`consistency.bench.tuning.noise_factor_fit`).
+    profile (see the top of this module).
     """
     scores = KnownScores(score)
     start = next((start for start in starts if np.isfinite(scores.total(start))), None)

@@ -1,9 +1,8 @@
 """Sequential test of the NIS for a deployed filter, with what a validation gate lets pass.
 
-A truncated chi-square, or ratios to the gate where a filter logs those.
-
-They are no NIS: how large the stated variance is cannot be told from them, and neither can a fault. What can be told is
-how often a filter whose variances are right exceeds a ratio at most.
+What a gate lets pass has a truncated chi-square distribution. Some filters log ratios to the gate in place of
+variances. Those are not the NIS: how large the stated variance is cannot be told from them, and neither can a fault.
+What can be told is how often a filter whose variances are right exceeds a ratio at most.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """What a document is made of: text, tables, lists of facts, figures.
 
-Numbers as words and colours, the same in every format.
-
-Colours are those of Okabe & Ito (2008). Each style has a dash pattern and a marker of its own as well, so that a grey
-print still reads.
+Numbers as words and colours are the same in every format. Colours are those of Okabe & Ito (2008). Each style has a
+dash pattern and a marker of its own as well, so that a grey print still reads.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Verdicts, maps, guards, comparisons and plans in rows and columns.
 
-Which figures stand where, in which order, and what they are called.
-
-Every place that shows verdicts takes them from here: terminal, reports, notebooks, static pages. What a view shows is a
-tuple of :class:`Measure`; to show another figure, write its function and put it into the views that have room for it.
+This module alone decides which figures stand where, in which order, and what they are called. Every place that shows
+verdicts takes them from here: terminal, reports, notebooks, static pages. What a view shows is a tuple of
+:class:`Measure`; to show another figure, write its function and put it into the views that have room for it.
 """
 
 from __future__ import annotations

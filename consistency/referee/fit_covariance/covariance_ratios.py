@@ -1,6 +1,6 @@
 """Ratios of true to stated covariance on drives that chose nothing, and what they show.
 
-The judged motions become a record and files.
+The judged motions become a record, and files that ``analyse --motions`` reads.
 """
 
 from __future__ import annotations

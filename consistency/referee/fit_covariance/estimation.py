@@ -1,7 +1,4 @@
-"""How parameters of drives are estimated.
-
-Maximum likelihood of covariances by scoring, and intervals from values with each drive left out.
-"""
+"""Maximum likelihood of covariances by scoring, and intervals from values with each drive left out."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """What a fit leaves as a folder.
 
-A model or a correction in TOML, files of data, lines for other programs, and a page with pictures.
+A model or a correction has a file in TOML, files of data, lines for other programs, and a page with pictures.
 """
 
 from __future__ import annotations
@@ -16,12 +16,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.records.groups import Groups
 from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.document.blocks import (
-    Chapter,
-    Document,
-    Figure,
-    Text,
-)
+from consistency.referee.document.blocks import Chapter, Document, Figure, Text
 from consistency.referee.fit_covariance.correct import (
     ByGroup,
     Correction,
@@ -34,12 +29,7 @@ from consistency.referee.fit_covariance.correct import (
 from consistency.referee.fit_covariance.covariance_ratios import write_motions
 from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
-from consistency.referee.fit_covariance.noise_model import (
-    NoiseModel,
-    correction,
-    data_of_model,
-    noise_document,
-)
+from consistency.referee.fit_covariance.noise_model import NoiseModel, correction, data_of_model, noise_document
 from consistency.referee.fit_covariance.pictures import draw_correction, draw_noise
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile

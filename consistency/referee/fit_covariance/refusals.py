@@ -1,9 +1,7 @@
 """What white noise does not describe.
 
-Drives that are refused, with reason and remedy, mean errors that differ between windows or drives, and errors that a
-second estimator shares.
-
-Limits are from drives of seven systems.
+Some drives are refused, with reason and remedy. Others have mean errors that differ between windows or drives, or
+errors that a second estimator shares. Limits are from drives of seven systems.
 """
 
 from __future__ import annotations

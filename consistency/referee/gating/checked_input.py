@@ -1,6 +1,6 @@
 """The input of a gate, of one estimator or of a candidate and its reference.
 
-Checked with messages that name run and step, and handed to the referee.
+It is checked, with messages that name run and step, and handed to the referee.
 """
 
 from __future__ import annotations
@@ -25,8 +25,6 @@ from consistency.referee.verdicts.judge_sources import Source
 
 if TYPE_CHECKING:
     from consistency.referee.verdicts.compare_sources import Baseline
-
-# --- arrays ----------------------------------------------------------------------------------------
 
 OF_RUNS = ("error", "covariance", "nees", "nis", "innovations", "innovation_covariances")  # (runs, steps, ...)
 NONE_FAILED = FailedRuns(0, 0)
@@ -129,6 +127,9 @@ def record_of_filter(
         filter_name = results.filters[0]
     record = results.record(filter_name).without_first(skip_of(skip))
     return replace(record.errors_alone, name=name or filter_name)
+
+
+# --- arrays ----------------------------------------------------------------------------------------
 
 
 def _gone(record: Record) -> Array | None:

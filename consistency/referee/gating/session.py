@@ -1,9 +1,7 @@
 """The gates of a test session.
 
-The false-alarm rate that they share, and the record of all, judged together at the end. Light, because the pytest
-plugin loads it with every session.
-
-Standard library only, so that a plugin loads fast.
+They share a false-alarm rate, and are judged together at the end. Standard library only, because the pytest plugin
+loads this module with every session.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Figures of one estimator: errors with their bounds, NEES, trajectory, coverage, innovations.
 
-The NIS over time.
-
-Where runs have one step, as those of a factor or a calibration, the runs stand along the axis, each a point.
+What a monitor found is drawn over time. Where runs have one step, as those of a factor or a calibration, the runs
+stand along the axis, each a point.
 """
 
 from __future__ import annotations

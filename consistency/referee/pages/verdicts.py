@@ -1,6 +1,6 @@
 """Estimators that were judged on the same runs.
 
-Their verdicts, what the referee asked of each, and the axis along the runs.
+Pages show their verdicts, what the referee asked of each, and the axis along the runs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The command of a program with its placeholders and seeds, and one run of it.
 
-A process group of its own in a fresh folder.
+A run is a process group of its own in a fresh folder.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The frame is that of least NEES, and the covariances are those of the residual errors.
 
-Their errors are carried, too.
+Errors of estimates are carried with them.
 """
 
 from __future__ import annotations

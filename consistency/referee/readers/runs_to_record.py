@@ -1,6 +1,6 @@
 """Runs of an estimator as arrays over (runs, steps), with failures and left-out steps.
 
-Whole, or in windows of a log.
+A log may also be cut into windows.
 """
 
 from __future__ import annotations

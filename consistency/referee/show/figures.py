@@ -1,9 +1,8 @@
 """How figures look, on a canvas of Matplotlib in the style of the reports, and figures as files.
 
-SVG, PNG, and what a user asks for.
-
-Sections draw on the axes directly; text is shown literally. A mark with a ``tag`` belongs to a filter, whose checkbox
-hides it on a page. Matplotlib is loaded when the first figure is drawn.
+Files are SVG for pages, PNG for notebooks, and what a user asks for. Sections draw on the axes directly; text is shown
+literally. A mark with a ``tag`` belongs to a filter, whose checkbox hides it on a page. Matplotlib is loaded when the
+first figure is drawn.
 """
 
 from __future__ import annotations

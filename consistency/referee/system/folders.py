@@ -1,12 +1,13 @@
 """Output folders: files and a manifest, written whole or not at all.
 
-Where a file came from, and the data that come with the package.
+A manifest says where files came from. The data that come with the package are found here, too.
 """
 
 from __future__ import annotations
 
 import ast
 import functools
+import hashlib
 import itertools
 import json
 import os
@@ -247,6 +248,22 @@ def _found() -> tuple[tuple[str, str], ...]:
             if library["user_api"] == "blas" and NOT_OURS not in library["filepath"]:
                 cores.add(str(library.get("architecture")))
     return ("cpu", _cpu()), ("blas", ", ".join(sorted(cores)) or "unknown")
+
+
+def digest_of_sources(root: Path, places: Iterable[str]) -> str:
+    """SHA-256 of modules below ``root``, their names and contents; a place is a file or a folder.
+
+    Raises
+    ------
+    FileNotFoundError
+        A place is gone.
+    """
+    digest = hashlib.sha256()
+    for name in places:
+        place = root / name
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def this_machine() -> dict[str, str]:

@@ -202,7 +202,7 @@ def characterise_board(
     Raises
     ------
     InputError
-        As :func:`consistency.stereo.characterising.boards.find_corners`, or an unknown model.
+        As :func:`find_corners`, or an unknown model.
     """
     if model not in MODELS:
         raise InputError(f"--distortion {model}: must be one of {', '.join(MODELS)}")

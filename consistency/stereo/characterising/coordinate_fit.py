@@ -1,8 +1,7 @@
 """Estimates of one coordinate, u, v or d, with intervals, by a restricted likelihood.
 
-Bias, an offset of each track, noise with memory.
-
-The shape of its noise, too: how heavy its tails are, and whether it is Gaussian at all.
+The likelihood has a bias, an offset of each track, and noise with memory. Another question is the shape of the noise:
+how heavy its tails are, and whether it is Gaussian at all.
 
 Residual i of track t is ``X_i beta + o_t + e_i``: ``o_t`` is drawn once per track with variance tau^2, ``e_i`` in each
 observation with standard deviation ``G_i a`` and correlation rho^gap with the one before. Patterson & Thompson (1971)

@@ -1,8 +1,7 @@
 """Characterisation with known poses, or a camera at rest, and unknown landmarks.
 
-Each track's point is fitted and paid for.
-
-In a step of least squares for points and poses together the points are eliminated, and the poses solved for at once.
+Each track's point is fitted, and the degrees of freedom that it takes are paid for. In a step of least squares for
+points and poses together the points are eliminated, and the poses solved for at once.
 
 A component of the noise (u, v, or d at some disparities) has the variance at which its squared residuals are what the
 degrees of freedom left to it say (Helmert 1907; Foerstner 1979): ``sum r^2 = sigma^2 sum (1 - h)``, with ``h`` the

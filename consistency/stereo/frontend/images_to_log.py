@@ -1,7 +1,6 @@
 """A sequence of stereo pairs as a planar log.
 
-Controls, observations of few landmarks, truth, trajectory, and the noise that a filter believes.
-
+The log has controls, observations of few landmarks, truth, trajectory, and the noise that a filter believes.
 Trajectories are texts that `consistency analyse` and the usual tools read.
 
 Motions in space become those of a robot on a plane: forward, left, up, and the heading about up.

@@ -1,6 +1,6 @@
 """From image pairs to tracks of u, v, d beside the truth: the chain of stages of Herath et al. (2007) fig. 3.
 
-What its errors leave becomes the tables of a sensor. The robot that stands before walls is their experiment 2.
+Its errors become the tables of a sensor. The stops of a robot before walls are experiment 2 of the chapter.
 """
 
 from __future__ import annotations

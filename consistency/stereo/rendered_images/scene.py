@@ -1,6 +1,6 @@
 """Scenes of flat layers at several depths, cameras with lenses, and image pairs that they take of them.
 
-What is painted on a layer: grey values over two coordinates in metres, blurred as a lens would.
+What is painted on a layer are grey values over two coordinates in metres, blurred as a lens would.
 
 The point spread is round on the surface that is seen, as wide as at the depth of the pixel: exact for a surface that
 faces the camera, and on a slanted one too narrow along the slant.

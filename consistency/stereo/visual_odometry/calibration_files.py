@@ -1,6 +1,6 @@
 """Stereo calibrations from files, as one record: KITTI, EuRoC / ASL, OpenCV and BoofCV.
 
-OpenCV's files are not quite YAML.
+OpenCV's files are not quite YAML, so that they have a reader of their own.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def visual_odometry(
     """The motion from each stereo pair to the next, one less than pairs; features are found once a pair.
 
     A motion that cannot be measured is a bridge between its neighbours, with the reason as its ``fault``; see
-    :func:`consistency.stereo.visual_odometry.odometry.bridged`.
+    :func:`bridged`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """gtsam 4.x in the bench: smoothers of all data so far, of a window, and of the whole trial, with their factors.
 
 gtsam chooses the order of elimination, linearises again what has moved, solves, and gives the marginals; the models are
-those of the belief (:mod:`consistency.bench.filters.external.gtsam`). iSAM2: Kaess et al., Int. J. Robotics
+those of the belief. iSAM2: Kaess et al., Int. J. Robotics
 Research 31(2), 2012. Systems are solved by QR, because a step is nearly certain across the heading.
 
 gtsam's smoothers change in place: a state is good for one step forward, and no older one can be gone back to.

@@ -1,9 +1,8 @@
 """Linear algebra of the kernels without an allocation.
 
-Loops over arrays, which compile fast, BLAS and LAPACK, definiteness.
-
-NumPy's constructors are compiled again for each kind of shape, so that kernels call those of this module. Where no
-value is given, an array has any. ``copy`` and ``fill`` write to the whole of their target.
+There are loops over arrays, which compile fast, BLAS and LAPACK, and definiteness. NumPy's constructors are compiled
+again for each kind of shape, so that kernels call those of this module. Where no value is given, an array has any.
+``copy`` and ``fill`` write to the whole of their target.
 
 ``np.dot`` and ``np.linalg`` inside a kernel allocate their results, know no triangular solve and no
 symmetric update, and call their BLAS through a Python-level import. So the function pointers that SciPy

@@ -16,13 +16,7 @@ from consistency.bench.filters.kernel.part_functions import (
     observed_width,
     predict_innovation,
 )
-from consistency.bench.filters.kernel.update_steps import (
-    Work,
-    combine_seen,
-    correct_iterated,
-    innovate,
-    linearise_seen,
-)
+from consistency.bench.filters.kernel.update_steps import Work, combine_seen, correct_iterated, innovate, linearise_seen
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman

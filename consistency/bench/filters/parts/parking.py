@@ -29,14 +29,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.update_steps import Work, gather_rows, replace_rows
 from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
-from consistency.bench.filters.parts.local import (
-    LOCAL_FROM,
-    add_label,
-    append_rows,
-    join,
-    take_out,
-    wake,
-)
+from consistency.bench.filters.parts.local import LOCAL_FROM, add_label, append_rows, join, take_out, wake
 from consistency.referee.types import Array, Indices
 
 WORTH = 1.1  # variables of the whole state for each of active part and base from which updating is local; measured

@@ -9,12 +9,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.judging.error_parts import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import (
-    MeanTest,
-    scale_test,
-    spreads_more,
-    spreads_more_in_steps,
-)
+from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.statistics.nees import anees
 from consistency.referee.diagnostics.verdict.parts import (
     AXIS,

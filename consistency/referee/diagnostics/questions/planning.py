@@ -1,7 +1,7 @@
 """How many runs a verdict needs.
 
-Looks at growing numbers of runs, a plan from a pilot, and the pieces of a single log. The formulas for one fixed
-number of runs are in ``statistics.number_of_runs``.
+There are looks at growing numbers of runs, a plan from a pilot, and the pieces of a single log. The formulas for one
+fixed number of runs are in ``statistics.number_of_runs``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ REACH = 5.0  # correlation times over which autocorrelations are summed: Sokal (
 LONG = 20.0  # correlation times that a log has at least; by simulation (benchmarks/single_log.py)
 APART = 10.0  # correlation times in a piece of a log that stands as a run
 MOST = 50  # pieces; more gain nothing
-# --- pieces that stand as runs -----------------------------------------------------------------------
 
 
 FEWEST = 20  # pieces
@@ -215,6 +214,9 @@ def correlation_time(series: Array) -> tuple[float, int]:
     if window_reached.any():
         lag = int(np.argmax(window_reached))
     return max(1.0, float(tau[lag])), max(lag, 1)
+
+
+# --- pieces that stand as runs -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
 """Truth with a covariance of its own.
 
-Errors d = e + v, of which P alone is judged, and errors that all estimates share. A truth without a covariance needs
-nothing of this module.
+Errors are d = e + v, of which P alone is judged. A truth without a covariance needs nothing of this module.
 
-Each error is e = J theta + n: theta, the same for all, has a prior, and n the stated covariance plus a floor, the
-scatter of the truth. Both are fitted to some data by maximum likelihood, with theta integrated out, and predicted for
-other data.
+Some errors are shared by all estimates. Each error is then e = J theta + n: theta, the same for all, has a prior, and
+n the stated covariance plus a floor, the scatter of the truth. Both are fitted to some data by maximum likelihood,
+with theta integrated out, and predicted for other data.
 """
 
 from __future__ import annotations

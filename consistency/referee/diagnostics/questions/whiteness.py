@@ -19,7 +19,6 @@ IMPOSSIBLE, UNLIKELY = 1e-9, 1e-3  # probability that any innovation of a right 
 FEW = 0.05  # share of innovations that may be called outliers
 FEWEST_INNOVATIONS = 400  # innovations; below, the chi-square of the portmanteau is not to be trusted
 FEWEST_EACH = 40  # innovations for each component, measured with up to 40 components
-# --- probable mix-ups: another number of components, or residuals after the update ----------------------------
 
 
 LEAST_GAIN = float(np.log(1e4))  # log likelihood that another number of components gains over a wrong scale
@@ -179,6 +178,9 @@ def _portmanteau(u: Array, lags: int) -> Whiteness:
     dof = lags * m * m
     bound = 1.96 / np.sqrt(pairs * m)
     return Whiteness(correlation, float(bound), statistic, dof, float(distributions.chi2.sf(statistic, dof)))
+
+
+# --- probable mix-ups: another number of components, or residuals after the update ----------------------------
 
 
 def innovation_causes(nis: Array, dof: Array, nees_ratio: float) -> list[str]:

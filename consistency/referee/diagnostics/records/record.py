@@ -1,8 +1,7 @@
 """The record: the runs of one estimator, as every source gives them and every verdict takes them.
 
-Whole, or without the first steps of each run.
-
-Values of skipped steps are NaN, so that every other step keeps its number. Alignment and time offsets use them before.
+The first steps of each run may be left out. Values of skipped steps are NaN, so that every other step keeps its
+number. Alignment and time offsets use them before.
 """
 
 from __future__ import annotations

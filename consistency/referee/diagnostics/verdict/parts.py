@@ -1,6 +1,6 @@
 """The questions of a verdict with the share of the false-alarm rate of each, and the parts that answer them.
 
-Frozen, with the shape of each field.
+The parts are frozen, and each field has its shape beside it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The verdict on one filter.
 
-What the tests found, the status that follows, the sentences that say so, and all of it as dictionaries for programs.
+It holds what the tests found, the status that follows, and the sentences that say so, and gives all of it to programs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Faults in words, the chief one first, each in the same order: what is wrong, by how much, and where.
 
-In all runs, in groups of them, or in blocks of the state.
+Where is all runs, groups of them, or blocks of the state.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Archives of arrays by key, (runs, steps, ...).
 
-NumPy (.npz), HDF5 and MATLAB, with states of inertial filters among them.
+They are those of NumPy (.npz), HDF5 and MATLAB. States of inertial filters have keys of their own.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are i
 ALIKE = 0.5  # correlation from run to run
 UNLIKE = 0.2  # of it, from step to step
 KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
-# --- files of MATLAB ---------------------------------------------------------------------------------
 
 
 HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
@@ -64,7 +63,7 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     (runs,), the number of steps of each run, where they differ, and ``mask`` (runs, steps), true where there is no
     truth, so that the step does not count. With ``--relative`` estimates and truth are planar
     poses, or estimates are motions; ``cross_covariances`` (runs, steps, 3, 3) are those with the step before. States of
-    inertial filters have keys of their own (:mod:`consistency.referee.readers.formats.archives`).
+    inertial filters have keys of their own (:func:`extended_errors`).
 
     Parameters
     ----------
@@ -504,6 +503,9 @@ def _lag(e: Array, axis: int) -> float:
     size = np.square(e).mean(axis=(0, 1))
     together = (e[1:] * e[:-1]).mean(axis=(0, 1))
     return float(np.mean(together / np.where(size > 0, size, 1.0)))
+
+
+# --- files of MATLAB ---------------------------------------------------------------------------------
 
 
 def load_matlab(path: Path) -> dict[str, Array]:

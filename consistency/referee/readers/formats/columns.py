@@ -1,8 +1,7 @@
 """Which columns of a file are what.
 
-Every spelling of a name that is known, and the places of columns by their meaning.
-
-A spelling that is missing is added here. Names of the user's own (``--columns``) are put in place of a file's.
+Places of columns are found by their meaning, under every spelling that is known; one that is missing is added here.
+Names of the user's own (``--columns``) are put in place of a file's.
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ from typing import NamedTuple
 from consistency.referee.column_names import POSE
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import listed
-
-# --- spellings ---------------------------------------------------------------------------------------
 
 POSITIONS = ("p_rs_r_{}", "p_{}", "p{}", "t_{}", "t{}", "pos_{}", "position_{}", "translation_{}", "{}")
 QUATERNIONS = ("q_rs_{}", "q_{}", "q{}", "quat_{}", "orientation_{}", "rotation_{}")
@@ -56,7 +53,6 @@ NUMBERED = re.compile(r"(.*?(?:covariance|cov|p))_?(\d+)(?:_(\d+))?")  # pose_co
 EUROC_END = ["bax", "bay", "baz"]  # of the 17 columns of EuRoC under short names
 _OTHER = r"deg(?:rees?)?|°|mm|cm|km(?:/?h)?|mph|kph|ft|feet|rpm"
 OTHER_UNITS = re.compile(rf"[\[(]\s*((?:{_OTHER})(?![a-z_])[^\])]*)[\])]", re.IGNORECASE)  # than SI and rad
-# --- names of the user's own -------------------------------------------------------------------------
 
 
 Columns = Mapping[str, str]  # names of columns here, and those in a file
@@ -445,6 +441,9 @@ def unit_in(name: str) -> int | None:
     if stated := re.search(r"[\[(_ ]\s*(s|sec|ms|us|ns|nsec)\s*[\])]?$", name.lower()):
         return UNITS[stated[1]]
     return 10**9 if plain_name(name) == RECORDED else None
+
+
+# --- names of the user's own -------------------------------------------------------------------------
 
 
 class Named(NamedTuple):

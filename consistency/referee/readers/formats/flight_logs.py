@@ -1,8 +1,6 @@
 """Flight logs: innovations of PX4's EKF2 and of ArduPilot's EKF, or the test ratios that they log in their place.
 
-ULog needs the extra ``ulog``.
-
-Needs the extra ``ardupilot``.
+ULog needs the extra ``ulog``, DataFlash the extra ``ardupilot``.
 """
 
 from __future__ import annotations

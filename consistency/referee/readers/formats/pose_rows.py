@@ -58,7 +58,6 @@ STATED = (0, TRIANGLE, FULL)  # columns of a covariance behind a matrix
 MATRIX_WIDTHS = {matrix + stated: (first, matrix) for matrix, first in MATRICES.items() for stated in STATED}
 LAYOUT = f"t tx ty tz qx qy qz qw ({', '.join(map(str, TUM))} columns)"
 AS_ESTIMATED = "poses with the standard deviations of x, y, z and of the rotation about x, y, z, in m and rad"
-# --- states of a simulation with OpenVINS ------------------------------------------------------------
 
 CAMERAS, CALIBRATION = 18, 15  # column with the number of cameras, and numbers of each one's calibration
 LARGEST = 200  # columns, of more cameras than OpenVINS takes
@@ -270,6 +269,9 @@ def _clock(lines: Lines, before: Array) -> tuple[Array, str]:
     if len(t) != count:
         raise InputError(f"{times}: has {len(t)} times, but {lines.path} {count} poses")
     return t, f"times from {times.name} beside them"
+
+
+# --- states of a simulation with OpenVINS ------------------------------------------------------------
 
 
 class States(Lines):

@@ -1,6 +1,6 @@
 """The mix-ups in files that are looked for.
 
-A unit, order, side, frame or convention of one file or of both, or a covariance in other axes.
+Each is a unit, order, side, frame or convention of one file or of both, or a covariance in other axes.
 """
 
 from __future__ import annotations

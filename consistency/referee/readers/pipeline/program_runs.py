@@ -41,7 +41,6 @@ PATHS = ("truth", "covariance")  # options of files, each with a path of its own
 OF_NUMBERS = ("axes", "relative", "windows", "align", "split", "truth_errors", "truth_shared")  # options
 Reader = Callable[[Path, Reading], Sequence[Estimator | Record]]
 LATE = 1.5  # steps of the estimates: the truth may go on by less than two
-# --- numbers of a run in place of its files ----------------------------------------------------------
 
 NUMBERS = "numbers.npz"  # in the folder of a run
 OF_POSES = tuple(name for name in (*OF_ESTIMATES, *OF_TRUTH) if name != "by")  # whose cells may be words
@@ -514,6 +513,9 @@ def _without_paths(note: str, one: Estimator) -> str:
     for path in (one.path, *one.runs[0].files):
         note = note.replace(str(path), "")
     return note
+
+
+# --- numbers of a run in place of its files ----------------------------------------------------------
 
 
 def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:

@@ -23,7 +23,8 @@ import numpy as np
 from scipy import signal, stats
 from script_options import options_of
 
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Record, Settings, Verdict, judge, make_record
+from consistency.referee.diagnostics.records.record import TruthFit
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment import Aligned, WorldTransform, clocks_and_frames, moved
 from consistency.referee.readers.clocks import clock_shift
@@ -191,20 +192,15 @@ def displaced(rng: np.random.Generator, runs: Sequence[Poses], mode: str) -> lis
 def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
     if mode in ("offset", "none"):
         shift, _ = clock_shift("bench", runs, "estimate" if mode == "offset" else 0.0)
-        return judge(evidence(Aligned(runs), shift), Settings(FALSE_ALARM))
+        return judge(evidence(Aligned(runs, TruthFit()), shift), Settings(FALSE_ALARM))
     shift, _, found = clocks_and_frames("bench", runs, 0.0, mode, range(3))  # a number keeps the clocks out of it
     return judge(evidence(found, shift), Settings(FALSE_ALARM))
 
 
 def evidence(found: Aligned, shift: float) -> Record:
     error = np.stack([p.errors(shift) for p in found.runs])
-    return Record(
-        "bench",
-        error,
-        np.stack([p.covariance for p in found.runs]),
-        reduced=found.reduced,
-        unavailable=found.unavailable,
-    )
+    record = make_record("bench", error, np.stack([p.covariance for p in found.runs]))
+    return replace(record, fit=replace(found.fit, align="none", caption="", unseen=0.0))
 
 
 def batch(case: Case, numbers: Sequence[int], seed: int) -> dict[str, Counter[str]]:

@@ -36,7 +36,7 @@ from script_options import options_of
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
-from consistency.diagnostics import Record, Settings, Verdict, e_process, follow, judge, sequential_design
+from consistency.diagnostics import Settings, Verdict, e_process, follow, judge, make_record, sequential_design
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.types import Array
 
@@ -128,14 +128,14 @@ def judged(case: Case, numbers: Sequence[int], seed: int) -> list[Outcome]:
 
 
 def _at_once(case: Case, gate_of: Growing) -> Outcome:
-    evidence = Record("gate", **vars(gate_of(case.runs)))
+    evidence = make_record("gate", **vars(gate_of(case.runs)))
     return _outcome(judge(evidence, Settings(case.false_alarm, DETECT, POWER)), case.runs)
 
 
 def _until_decided(case: Case, gate_of: Growing) -> Outcome:
     """The verdict of ``--until-decided``, and the runs it took."""
     design = sequential_design(ANY[case.world].dof or DOF, DETECT, case.false_alarm, POWER, MOST)
-    return _outcome(*follow(design, lambda runs: Record("gate", **vars(gate_of(runs)))))
+    return _outcome(*follow(design, lambda runs: make_record("gate", **vars(gate_of(runs)))))
 
 
 def _betting(case: Case, gate_of: Growing) -> Outcome:
@@ -221,10 +221,10 @@ def _kalman_runs(count: int, seed: int, folder: Path) -> Path:
         runs = min(CHUNK, count - chunk * CHUNK)
         of_chunk = int(np.random.default_rng((seed, chunk)).integers(2**31))
         c = record_of(cs.run_trials(scenario, ["kf"], runs=runs, seed=of_chunk), "kf")
-        assert c.error is not None
-        covariance = np.asarray(c.covariance)
+        assert c.errors.error is not None
+        covariance = np.asarray(c.errors.covariance)
         assert (covariance == covariance[0]).all()
-        errors.append(c.error[:, 1:])
+        errors.append(c.errors.error[:, 1:])
     np.save(folder / "covariance.npy", covariance[0, 1:])
     np.save(folder / "error.npy", np.concatenate(errors))
     return folder

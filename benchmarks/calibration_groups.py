@@ -14,7 +14,7 @@ from calibration_cases import DETECT, FALSE_ALARM, POWER
 from calibration_gates import Draw, first_order, row, shared, standard
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, Verdict, judge
+from consistency.diagnostics import Settings, Verdict, judge, make_record
 from consistency.errors import InputError
 from consistency.referee.diagnostics.questions.sample import Sample
 from consistency.referee.diagnostics.questions.scale import equivalence
@@ -208,7 +208,7 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
 
 def grouped(error: Array, covariance: Array, values: Array, bins: int | Sequence[float]) -> Verdict:
     groups = groups_of(column_of("by", values), bins, np.isfinite(error[..., 0]))
-    return judge(Record("grouped", error, covariance, groups=groups), Settings(FALSE_ALARM, DETECT, POWER))
+    return judge(make_record("grouped", error, covariance, groups=groups), Settings(FALSE_ALARM, DETECT, POWER))
 
 
 def _false(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
@@ -233,7 +233,7 @@ def _clear(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
                 error, covariance, values = of.draw(rng, runs)
                 n, nees = error.shape[-1], ratio * _nees(error, covariance)
                 groups = groups_of(column_of("by", values), of.bins, np.isfinite(nees))
-                sample = Sample(Record(world, nees=nees, dof=n, groups=groups), nees, n)
+                sample = Sample(make_record(world, nees=nees, dof=n, groups=groups), nees, n)
                 number = int(rng.integers(len(groups.names)))
                 one = sample.in_group(number)
                 if len(one.means):

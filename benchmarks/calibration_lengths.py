@@ -14,7 +14,7 @@ import numpy as np
 from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
 from calibration_gates import row, shared
 
-from consistency.diagnostics import Record, Settings, follow, gate_runs, judge, sequential_design
+from consistency.diagnostics import Record, Settings, follow, gate_runs, judge, make_record, sequential_design
 from consistency.referee.diagnostics.judging.error_parts import run_tests
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.groups import column_of, groups_of
@@ -155,7 +155,7 @@ def measured(rng: np.random.Generator, of: Measured, runs: int) -> Record:
     there = of.ends(innovation)
     error = np.where(there[..., None], error, np.nan)[there.any(axis=1)]
     covariance = np.broadcast_to(variance[:, None, None] * np.eye(of.n), (*error.shape, of.n))
-    return Record("measured", error, covariance, np.square(error).sum(axis=2) / variance, of.n)
+    return make_record("measured", error, covariance, np.square(error).sum(axis=2) / variance, of.n)
 
 
 def p_value(record: Record) -> float:
@@ -220,7 +220,7 @@ def _needs_factors(rng: np.random.Generator, runs: int) -> bool:
     groups = groups_of(column_of("by", values), 5, np.isfinite(values))
     covariance = np.broadcast_to(variance[:, None, None], (*error.shape, 1))
     nees = np.square(error[..., 0]) / variance
-    fits = fit_groups(Record("by", error, covariance, nees, 1, groups=groups), blocks_of(("x",), 1, False))
+    fits = fit_groups(make_record("by", error, covariance, nees, 1, groups=groups), blocks_of(("x",), 1, False))
     return are_needed([fits[name] for name in groups.names])
 
 
@@ -242,14 +242,14 @@ def one_long(rng: np.random.Generator, groups: int, others: int, share: float, n
     error[np.arange(long) >= steps[:, None]] = np.nan
     name = np.repeat([f"site {g}" for g in range(groups)], others + 1)
     by = groups_of(column_of("site", np.repeat(name[:, None], long, axis=1)), 5, np.isfinite(error[..., 0]))
-    return Record("sites", error, shared(np.eye(n), error), dof=n, groups=by)
+    return make_record("sites", error, shared(np.eye(n), error), dof=n, groups=by)
 
 
 def _of_lengths(rng: np.random.Generator, lengths: Lengths, runs: int, ratio: float, n: int = 3) -> Record:
     error = np.sqrt(ratio) * np.repeat(rng.standard_normal((runs, 1, n)), STEPS, axis=1)
     there = np.arange(STEPS) < lengths(rng, runs)[:, None]
     nees = np.where(there, np.square(error).sum(axis=2), np.nan)
-    return Record("lengths", nees=nees, dof=n)
+    return make_record("lengths", nees=nees, dof=n)
 
 
 def _power(quick: bool, seed: int) -> Iterator[dict[str, Any]]:

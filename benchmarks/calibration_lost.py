@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from calibration_gates import row
 
-from consistency.diagnostics import Record, Settings, Verdict, follow, gate_runs, judge, sequential_design
+from consistency.diagnostics import Settings, Verdict, follow, gate_runs, judge, make_record, sequential_design
 from consistency.referee.types import Array
 
 STEPS, DOF, SHARE, DETECT = 20, 3, 0.05, 1.5
@@ -49,7 +49,7 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     def add(question: str, world: str, runs: int, share: float, settings: Settings, stated: float, bound: str) -> None:
         rng = np.random.default_rng((seed, zlib.crc32(f"{question} {world}".encode()), runs))
         draws = (WORLDS[world](rng, runs, share) for _ in range(gates))
-        said = [judge(Record("gate", nees=nees, dof=DOF), settings).consistent for nees in draws]
+        said = [judge(make_record("gate", nees=nees, dof=DOF), settings).consistent for nees in draws]
         ratio, name = DETECT if share else 1.0, f"{100 * share:g} % lost, {world}"
         table.append(row(name, question, ratio, runs, stated, bound, len(said), sum(said)))
 
@@ -67,7 +67,7 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
 def until_decided(nees: Array) -> Verdict:
     """The verdict of ``--until-decided --lost 0.05`` on the NEES (runs, T), runs as they come."""
     design = sequential_design(DOF, DETECT, max_runs=len(nees), lost=SHARE)
-    return follow(design, lambda runs: Record("gate", nees=nees[:runs], dof=DOF))[0]
+    return follow(design, lambda runs: make_record("gate", nees=nees[:runs], dof=DOF))[0]
 
 
 def _independent(rng: np.random.Generator, runs: int, share: float) -> Array:

@@ -6,12 +6,13 @@ covariance of its own. ``calibration.py`` puts the rows into its table.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from calibration_gates import row
 
-from consistency.diagnostics import JointNees, Record, Verdict, judge
+from consistency.diagnostics import JointNees, Map, Verdict, judge, make_record
 from consistency.referee.types import Array
 
 LANDMARKS, POSE = 12, 3
@@ -56,7 +57,8 @@ def verdict(rng: np.random.Generator, runs: int, ratio: float = 1.0, whole: bool
     parts = np.square(w).reshape(runs, -1, 3).sum(axis=-1)
     joint = JointNees(parts[:, 0], parts[:, 1:].sum(axis=1), np.full(runs, 3 * LANDMARKS), parts[:, 1:])
     covariance = np.broadcast_to(P, (*error.shape, 3)).copy()
-    return judge(Record("map", error, covariance, landmarks=np.arange(LANDMARKS), joint=joint))
+    record = make_record("map", error, covariance)
+    return judge(replace(record, map=Map(landmarks=np.arange(LANDMARKS), joint=joint)))
 
 
 def _covariance(rng: np.random.Generator) -> Array:

@@ -6,13 +6,14 @@ rows into its table.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
-from consistency.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge, make_record
 from consistency.referee.diagnostics.questions.planning import in_pieces
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.geometry import SPATIAL, spatial_error
@@ -40,7 +41,7 @@ ABOUT = {
 def log_of(rng: np.random.Generator, constant: float, ratio: float) -> Record:
     e = np.sqrt(1.0 - constant) * stationary(rng.standard_normal((STEPS, DOF)), RHO)
     e = np.sqrt(ratio) * (e + np.sqrt(constant) * rng.standard_normal((1, DOF)))
-    return Record("log", e[None], np.broadcast_to(np.eye(DOF), (1, STEPS, DOF, DOF)))
+    return make_record("log", e[None], np.broadcast_to(np.eye(DOF), (1, STEPS, DOF, DOF)))
 
 
 def study_of(rng: np.random.Generator, convention: str) -> Record:
@@ -52,8 +53,8 @@ def study_of(rng: np.random.Generator, convention: str) -> Record:
     records = {}
     for kind in SPATIAL:
         error = spatial_error(true, estimate, kind).reshape(RUNS, POSES, 6)
-        records[kind] = Record("est", error, P, nees(error, P), 6, convention=kind)
-    return Record("est", records["so3"].error, P, records["so3"].nees, 6, convention="so3", guesses=records)
+        records[kind] = make_record("est", error, P, nees(error, P), 6, convention=kind)
+    return replace(records["so3"], guesses=records)
 
 
 def applied(pose: Array, e: Array, convention: str) -> Array:

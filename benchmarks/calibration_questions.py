@@ -14,7 +14,7 @@ import numpy as np
 from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
-from consistency.diagnostics import Record, Verdict, judge, mean_shape
+from consistency.diagnostics import Verdict, judge, make_record, mean_shape
 from consistency.referee.diagnostics.verdict.parts import SHARES, STEP
 from consistency.referee.types import Array
 
@@ -117,7 +117,7 @@ def _of_p(world: str, question: str, runs: int, stated: float, p: Array) -> dict
 
 def _of_innovations(rng: np.random.Generator, dof: tuple[int, ...], runs: int, steps: int) -> Verdict:
     of_step = rng.choice(dof, (runs, steps)) if len(dof) > 1 else np.full((runs, steps), dof[0])
-    return judge(Record("nis", nis=rng.chisquare(of_step), nis_dof=of_step, optimal_gain=True))
+    return judge(make_record("nis", nis=rng.chisquare(of_step), nis_dof=of_step, optimal_gain=True))
 
 
 def _of_gaps(rng: np.random.Generator, world: str, runs: int) -> Verdict:
@@ -130,7 +130,7 @@ def _of_gaps(rng: np.random.Generator, world: str, runs: int) -> Verdict:
         nees[rng.random(nees.shape) < (0.4 if world == "40 % missing" else 0.1)] = np.nan
     if world == "few go on":
         nees[(order >= 10) & (step >= GAP_STEPS // 2)] = np.nan
-    return judge(Record("gaps", nees=nees, dof=3))
+    return judge(make_record("gaps", nees=nees, dof=3))
 
 
 def whitened(rng: np.random.Generator, name: str, runs: int, n: int) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from calibration_gates import row
 from scipy import special, stats
 
-from consistency.diagnostics import Record, judge, ratio_interval
+from consistency.diagnostics import Record, judge, make_record, ratio_interval
 from consistency.referee.diagnostics.comparison import RunSummary, compare
 from consistency.referee.diagnostics.questions import scale
 from consistency.referee.diagnostics.verdict.parts import SHARES
@@ -123,7 +123,7 @@ def _evidence(rng: np.random.Generator, n: int, group: int, share: float, runs: 
     error = rng.standard_normal((runs, GATE_STEPS, n))
     constant = rng.random(runs) < share
     error[constant, :, :group] = rng.standard_normal((int(constant.sum()), 1, group))
-    return Record("spread", error=error, covariance=np.broadcast_to(np.eye(n), (*error.shape, n)))
+    return make_record("spread", error=error, covariance=np.broadcast_to(np.eye(n), (*error.shape, n)))
 
 
 def _misses_coverage(rng: np.random.Generator, runs: int) -> bool:

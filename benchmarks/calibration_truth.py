@@ -12,7 +12,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy import optimize
 
-from consistency.diagnostics import Record, judge
+from consistency.diagnostics import Record, judge, make_record
 from consistency.referee.types import Array
 
 RUNS, STEPS, DOF = 50, 20, 3
@@ -56,7 +56,9 @@ def gate(rng: np.random.Generator, kind: str, s: float, ratio: float, errors: st
         + errors_of_truth(rng, kind) @ np.linalg.cholesky(Q).T
     )
     shape = (RUNS, STEPS, DOF, DOF)
-    return Record("gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors)
+    return make_record(
+        "gate", e, np.broadcast_to(P, shape), truth_covariance=np.broadcast_to(Q, shape), truth_errors=errors
+    )
 
 
 def errors_of_truth(rng: np.random.Generator, kind: str) -> Array:

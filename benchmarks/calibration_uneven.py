@@ -14,7 +14,7 @@ import numpy as np
 from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
 from calibration_gates import row, shared, stationary
 
-from consistency.diagnostics import Record, Settings, Verdict, follow, judge, sequential_design
+from consistency.diagnostics import Settings, Verdict, follow, judge, make_record, sequential_design
 from consistency.referee.diagnostics.questions.planning import pilot_plan
 from consistency.referee.diagnostics.questions.scale import scale_test
 from consistency.referee.diagnostics.questions.whiteness import whiteness
@@ -147,7 +147,7 @@ def verdict_of(rng: np.random.Generator, squares: Array, n: int, settings: Setti
     error = np.sqrt(squares)[:, None, None] * rng.standard_normal((runs, steps, n))
     if not white:
         error = np.repeat(error, ALIKE, axis=1)
-    return judge(Record("uneven", error, shared(np.eye(n), error)), settings)
+    return judge(make_record("uneven", error, shared(np.eye(n), error)), settings)
 
 
 def _allowed(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
@@ -191,7 +191,7 @@ def _decided(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
 
 def _is_decided_consistent(rng: np.random.Generator, squares: Array, n: int) -> bool:
     error = np.repeat(np.sqrt(squares)[:, None, None] * rng.standard_normal((MOST, 1, n)), ALIKE, axis=1)
-    record = Record("uneven", error, shared(np.eye(n), error))
+    record = make_record("uneven", error, shared(np.eye(n), error))
     verdict, _ = follow(sequential_design(n, DETECT, FALSE_ALARM, POWER, MOST), record.first_runs)
     return verdict.consistent
 
@@ -204,7 +204,9 @@ def _named(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         found = 0
         for _ in range(gates):
             error = scale * stationary(rng.standard_normal((BLOCK_RUNS, BLOCK_STEPS, 6)), 0.9, axis=1)
-            record = Record("uneven", error, shared(np.eye(6), error), axes=("x", "y", "z", "roll", "pitch", "yaw"))
+            record = make_record(
+                "uneven", error, shared(np.eye(6), error), axes=("x", "y", "z", "roll", "pitch", "yaw")
+            )
             found += "attitude right" in judge(record, Settings(FALSE_ALARM)).reasons[0]
         yield row(world, NAMED, ratio, BLOCK_RUNS, stated, bound, gates, found)
 

@@ -13,7 +13,7 @@ import numpy as np
 from calibration_gates import row, stationary
 from scipy import stats
 
-from consistency.diagnostics import Record, judge
+from consistency.diagnostics import judge, make_record
 from consistency.referee.diagnostics.questions.whiteness import ENOUGH, independence
 from consistency.referee.types import Array
 
@@ -50,7 +50,7 @@ def undoubted(w: Array) -> bool:
     if independence(w).doubtful:
         return False
     covariance = np.broadcast_to(np.eye(n), (count, 1, n, n))
-    return bool(judge(Record("log", w[:, None], covariance, unit="window")).faults)
+    return bool(judge(make_record("log", w[:, None], covariance, unit="window")).faults)
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:

@@ -118,7 +118,7 @@ def body_frame(draw: Draw) -> Gate:
 def left_invariant(draw: Draw) -> Gate:
     """Errors and covariances as ``analyse --error left`` works them out of planar poses."""
     recording = recorded(*left_poses(draw))
-    return Gate(recording.error, np.asarray(recording.covariance))
+    return Gate(recording.errors.error, np.asarray(recording.errors.covariance))
 
 
 def ragged(draw: Draw) -> Gate:

@@ -25,7 +25,7 @@ from script_options import options_of
 
 from consistency.referee.diagnostics.questions.scale import run_means
 from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, make_record
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import binomial_interval
 from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, with_factors
@@ -98,7 +98,9 @@ class World:
 
 def record_of(error: Array, P: Array) -> Record:
     n = error.shape[-1]
-    return Record("drawn", error, P, squared_length(whiten(error, P)), n, axes=NAMES[:n], runs=np.arange(len(error)))
+    return make_record(
+        "drawn", error, P, squared_length(whiten(error, P)), n, axes=NAMES[:n], runs=np.arange(len(error))
+    )
 
 
 class Row(NamedTuple):
@@ -132,8 +134,8 @@ def row_of(world: World, draws: int, rng: np.random.Generator) -> Row:
         fit = fit_runs(record, true.blocks)
         whole = before_dropping(record, fit).factor
         after = with_factors(record, [(factors,) for factors in fit.left_out])
-        assert after.nees is not None
-        ratios[i] = run_means(after.nees)[0].mean() / world.n
+        assert after.errors.nees is not None
+        ratios[i] = run_means(after.errors.nees)[0].mean() / world.n
         needed[i] = are_needed([fit])
         for b, block in enumerate(true.blocks):
             factor, floor = fit.factor[b], fit.floor[b]
@@ -158,9 +160,9 @@ def of_groups(runs: int, rho: float, draws: int, rng: np.random.Generator) -> fl
     for i in range(draws):
         right = world.drawn(rng)
         index = np.repeat(rng.integers(0, 3, (runs, STEPS // 10)), 10, axis=1)
-        assert right.error is not None
-        assert right.covariance is not None
-        record = record_of(right.error * np.sqrt(sizes[index])[..., None], right.covariance)
+        assert right.errors.error is not None
+        assert right.errors.covariance is not None
+        record = record_of(right.errors.error * np.sqrt(sizes[index])[..., None], right.errors.covariance)
         groups = Groups("speed", ("low", "middle", "high"), index, (1.0, 2.0))
         fits = fit_groups(replace(record, groups=groups), world.true.blocks)
         for g, name in enumerate(groups.names):
@@ -186,19 +188,19 @@ BY_GROUP = tuple(product((10, 30), (0.0, 0.9, 0.999)))
 def heavy(world: World, rng: np.random.Generator) -> Record:
     """Student's t with 3 degrees of freedom."""
     record = world.drawn(rng)
-    assert record.error is not None
-    assert record.covariance is not None
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
     tails = np.sqrt(3.0 / rng.chisquare(3.0, (world.runs, STEPS, 1)))
-    return record_of(record.error * tails, record.covariance)
+    return record_of(record.errors.error * tails, record.errors.covariance)
 
 
 def biased(world: World, rng: np.random.Generator) -> Record:
     """A mean error of one sigma."""
     record = world.drawn(rng)
-    assert record.error is not None
-    assert record.covariance is not None
-    sigma = np.sqrt(np.diagonal(world.true.applied(record.covariance), axis1=2, axis2=3))
-    return record_of(record.error + sigma, record.covariance)
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    sigma = np.sqrt(np.diagonal(world.true.applied(record.errors.covariance), axis1=2, axis2=3))
+    return record_of(record.errors.error + sigma, record.errors.covariance)
 
 
 def of_wrong_sign(world: World, rng: np.random.Generator) -> Record:

@@ -16,7 +16,7 @@ import numpy as np
 from calibration_gates import stationary
 from scipy import stats
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.types import Array
 
 WORLDS = {"independent": 0.0, "AR(0.9)": 0.9, "AR(0.99)": 0.99, "one error a run": 1.0}
@@ -38,7 +38,7 @@ def errors(rng: np.random.Generator, rho: float, runs: int, steps: int, tails: b
 def hinted(error: Array) -> tuple[bool, bool]:
     """Whether a fault was found, and said to be in the first steps only."""
     runs, steps, n = error.shape
-    verdict = judge(Record("filter", error, np.broadcast_to(np.eye(n), (runs, steps, n, n))), SETTINGS)
+    verdict = judge(make_record("filter", error, np.broadcast_to(np.eye(n), (runs, steps, n, n))), SETTINGS)
     assert verdict.location is not None
     return bool(verdict.faults), verdict.location.until is not None
 

@@ -23,7 +23,7 @@ from calibration_windows import undoubted, windows_of
 from scipy import stats
 from script_options import options_of
 
-from consistency.diagnostics import Record, Verdict, compare, e_process, judge
+from consistency.diagnostics import Verdict, compare, e_process, judge, make_record
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.types import Array
 
@@ -62,12 +62,12 @@ def lost(rng: Rng, runs: int) -> Array:
 
 def faults(draw: Callable[[Rng, int], Array], runs: int, gates: int, rng: Rng) -> int:
     """Gates in which any question finds a fault."""
-    return sum(bool(judge(Record("gate", nees=draw(rng, runs), dof=DOF)).faults) for _ in range(gates))
+    return sum(bool(judge(make_record("gate", nees=draw(rng, runs), dof=DOF)).faults) for _ in range(gates))
 
 
 def unnamed(draw: Callable[[Rng, int], Array], runs: int, gates: int, rng: Rng) -> int:
     """Gates in which a fault is found and early ends are not named."""
-    verdicts = (judge(Record("gate", nees=draw(rng, runs), dof=DOF)) for _ in range(gates))
+    verdicts = (judge(make_record("gate", nees=draw(rng, runs), dof=DOF)) for _ in range(gates))
     return sum(bool(v.faults) and not (v.ends is not None and v.ends.lost) for v in verdicts)
 
 

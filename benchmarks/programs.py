@@ -32,7 +32,7 @@ import consistency as cs
 from consistency.referee.programs.process import program_of
 from consistency.referee.programs.study import Plan, run_study
 from consistency.referee.readers.options import Reading
-from consistency.referee.readers.pipeline.program_runs import Runs
+from consistency.referee.readers.pipeline.program_runs import ProgramRuns
 from consistency.referee.system.progress import quiet
 
 STATE = ("a", "b", "c")
@@ -93,8 +93,8 @@ def time_for_a_run(runs: int) -> None:
 
         return inner
 
-    Runs.take = timed(Runs.take, "reading")  # type: ignore[method-assign]
-    Runs.estimators = timed(Runs.estimators, "merging")  # type: ignore[method-assign]
+    ProgramRuns.take = timed(Runs.take, "reading")  # type: ignore[method-assign]
+    ProgramRuns.estimators = timed(Runs.estimators, "merging")  # type: ignore[method-assign]
     before = resource.getrusage(resource.RUSAGE_SELF)
     with tempfile.TemporaryDirectory() as place:
         plan = Plan(runs, jobs=1)

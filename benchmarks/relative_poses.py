@@ -197,8 +197,8 @@ def first_order(draws: int, seed: int) -> Iterator[str]:
                 sigma = np.array(SIGMA[group])
                 sigma[n // 2 if n == 6 else 2 :] = noise / 10.0  # of each of 100 motions
                 record = recorded([motion_stretch(drive(rng, group, 1000, 1.0, sigma))], "100", True)
-                assert record.nees is not None
-                values += list(record.nees.ravel() / n)
+                assert record.errors.nees is not None
+                values += list(record.errors.nees.ravel() / n)
             error = np.std(values) / np.sqrt(len(values))
             cells.append(f"{np.mean(values):.3f} ± {error:.3f}")
         yield f"| {noise:g} | {' | '.join(cells)} |"

@@ -20,7 +20,7 @@ from calibration_gates import stationary
 from scipy import stats
 from script_options import options_of
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions.planning import within
 from consistency.referee.types import Array
 
@@ -76,7 +76,7 @@ def decided(draws: int, seed: int) -> Iterator[tuple[str, bool]]:
                 log = np.sqrt(ratio) * errors(rng, rho, length * pilot.pieces, n)
                 cut = log.reshape(pilot.pieces, length, n)
                 P = np.broadcast_to(np.eye(n), (*cut.shape, n))
-                verdict = judge(Record("log", cut, P), SETTINGS)
+                verdict = judge(make_record("log", cut, P), SETTINGS)
                 faults += bool(verdict.faults)
                 if verdict.status in counts:
                     counts[verdict.status] += 1

@@ -36,6 +36,7 @@ _MODULES = {
     "guarded": "bench.filters.compiled",
     "judge": "referee.notebook.read_and_judge",
     "load_scenario": "bench.scenario",
+    "make_record": "referee.diagnostics.records.record",
     "monte_carlo": "referee.programs.study",
     "nees": "referee.diagnostics.statistics.nees",
     "read": "referee.notebook.read_and_judge",

@@ -25,6 +25,7 @@ from .bench.types import Trial as Trial
 from .referee.diagnostics.monitor import Alarm as Alarm
 from .referee.diagnostics.monitor import Monitor as Monitor
 from .referee.diagnostics.records.record import Record as Record
+from .referee.diagnostics.records.record import make_record as make_record
 from .referee.diagnostics.statistics.nees import anees as anees
 from .referee.diagnostics.statistics.nees import anees_interval as anees_interval
 from .referee.diagnostics.statistics.nees import nees as nees

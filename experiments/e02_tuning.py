@@ -73,11 +73,11 @@ def is_optimistic(upper: np.ndarray, status: str) -> bool | None:
 
 def inside(curves: cs.Record) -> np.ndarray:
     """Share of judged steps within 2 sigma, for each run and axis, shape (runs, 3); 0 after a failure."""
-    assert curves.error is not None
-    assert curves.nees is not None
-    sigma = np.sqrt(np.diagonal(np.asarray(curves.covariance), axis1=-2, axis2=-1))
-    deficient = np.isfinite(curves.error).all(axis=-1) & ~np.isfinite(curves.nees)
-    within = np.nan_to_num(np.abs(curves.error), nan=np.inf) <= 2 * np.nan_to_num(sigma)
+    assert curves.errors.error is not None
+    assert curves.errors.nees is not None
+    sigma = np.sqrt(np.diagonal(np.asarray(curves.errors.covariance), axis1=-2, axis2=-1))
+    deficient = np.isfinite(curves.errors.error).all(axis=-1) & ~np.isfinite(curves.errors.nees)
+    within = np.nan_to_num(np.abs(curves.errors.error), nan=np.inf) <= 2 * np.nan_to_num(sigma)
     return np.asarray((within & ~deficient[..., None]).sum(axis=1) / (~deficient).sum(axis=1)[:, None])
 
 

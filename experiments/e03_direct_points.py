@@ -26,10 +26,10 @@ def main(study: cs.Study) -> list[cs.Finding]:
     verdict, c = study.judged("herath2007-xyz", "ekf-xyz")
     exact, _ = study.judged("linear-gaussian", "kf")
     scale, exact_scale = verdict.scale, exact.scale
-    assert c.nees is not None
+    assert c.errors.nees is not None
     assert scale is not None
     assert exact_scale is not None
-    band = simultaneous_band(c.nees, scale.dof, ALARM, method="bonferroni")
+    band = simultaneous_band(c.errors.nees, scale.dof, ALARM, method="bonferroni")
     return [
         study.finding(
             is_well_bounded(

@@ -128,14 +128,18 @@ class Measured:
 def measured(results: Results, name: str) -> Measured:
     """Statistics of the one run of filter ``name``."""
     c = record_of(results, name)
-    assert c.error is not None
-    assert c.nees is not None
-    error, P, nees = c.error[0, SETTLED:], np.asarray(c.covariance)[0, SETTLED:], c.nees[0, SETTLED:]
+    assert c.errors.error is not None
+    assert c.errors.nees is not None
+    error, P, nees = (
+        c.errors.error[0, SETTLED:],
+        np.asarray(c.errors.covariance)[0, SETTLED:],
+        c.errors.nees[0, SETTLED:],
+    )
     bound = anees_interval(3, 1, 1 - 2 * ALARM / len(nees))[1]  # one-sided
     outside = np.abs(error) > 2 * np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    nis = np.asarray(c.nis)
-    dof = int(np.asarray(c.nis_dof)[np.isfinite(nis)].sum())
-    far = np.hypot(*c.error[0, :, :2].T)
+    nis = np.asarray(c.innovations.nis)
+    dof = int(np.asarray(c.innovations.nis_dof)[np.isfinite(nis)].sum())
+    far = np.hypot(*c.errors.error[0, :, :2].T)
     return Measured(
         nees=float("inf") if c.failures else float(nees.mean()) / 3,
         above=int((nees > bound).sum()),

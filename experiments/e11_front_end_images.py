@@ -18,7 +18,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
-from consistency.diagnostics import Record, Verdict, judge
+from consistency.diagnostics import Verdict, judge, make_record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.stopping import write_whole
 from consistency.referee.types import Array
@@ -165,7 +165,7 @@ def halves(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def referee(errors: Array, covariances: Array) -> Verdict:
     """The bench's verdict with every motion as a run of one step."""
-    return judge(Record("motions", errors[:, None], covariances[:, None], axes=AXES))
+    return judge(make_record("motions", errors[:, None], covariances[:, None], axes=AXES))
 
 
 def floored(errors: Array, covariances: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script, sibling
-from consistency.diagnostics import Record, Settings, detectable_ratio, judge
+from consistency.diagnostics import Settings, detectable_ratio, judge, make_record
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
 from consistency.vision import (
@@ -68,7 +68,7 @@ class Errors:
     failures: tuple[Failure, ...] = ()
 
     def row(self) -> dict[str, object]:
-        evidence = Record(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
+        evidence = make_record(self.name, self.error[:, None], self.covariance[:, None], failures=self.failures)
         verdict = judge(evidence, Settings(false_alarm=ALARM))
         dof = self.error.shape[1]
         return {

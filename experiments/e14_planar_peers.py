@@ -100,10 +100,10 @@ def worlds(name: str) -> list[cs.Scenario]:
 def of_runs(study: cs.Study, world: cs.Scenario, name: str) -> Array:
     """NEES and mean square errors of position and heading of each run, (R, 3)."""
     c = study.judged(world, name)[1].in_world
-    assert c.error is not None
-    assert c.nees is not None
-    square = np.square(c.error[:, SKIPPED:])
-    per_run = c.nees[:, SKIPPED:], square[..., :2].sum(axis=-1), square[..., 2]
+    assert c.errors.error is not None
+    assert c.errors.nees is not None
+    square = np.square(c.errors.error[:, SKIPPED:])
+    per_run = c.errors.nees[:, SKIPPED:], square[..., :2].sum(axis=-1), square[..., 2]
     return np.column_stack([each.mean(axis=1) for each in per_run])
 
 

@@ -95,11 +95,11 @@ class Row(NamedTuple):
 
 
 def row(name: str, filter_: str, verdict: cs.Verdict, c: cs.Record) -> Row:
-    assert c.error is not None
-    assert c.nees is not None
-    nees = np.inf if c.failures else float(np.nanmean(c.nees)) / 3
-    square = np.square(c.error[0])
-    values, dof = np.asarray(c.nis), np.asarray(c.nis_dof)
+    assert c.errors.error is not None
+    assert c.errors.nees is not None
+    nees = np.inf if c.failures else float(np.nanmean(c.errors.nees)) / 3
+    square = np.square(c.errors.error[0])
+    values, dof = np.asarray(c.innovations.nis), np.asarray(c.innovations.nis_dof)
     nis = float(np.nansum(values) / dof[np.isfinite(values)].sum())
     position, heading = np.sqrt(np.nanmean(square[:, :2].sum(axis=1))), np.sqrt(np.nanmean(square[:, 2]))
     return Row(name, filter_, verdict.status, nees, nis, float(position), float(heading))

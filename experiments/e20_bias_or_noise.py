@@ -128,9 +128,9 @@ def nodes_of(world: cs.Scenario) -> pd.DataFrame:
 
 
 def over_steps(belief: str, curves: cs.Record) -> pd.DataFrame:
-    assert curves.nees is not None
-    known = np.isfinite(curves.nees).any(axis=0)
-    nees = np.nanmean(curves.nees[:, known], axis=0)
+    assert curves.errors.nees is not None
+    known = np.isfinite(curves.errors.nees).any(axis=0)
+    nees = np.nanmean(curves.errors.nees[:, known], axis=0)
     return pd.DataFrame({"belief": belief, "step": np.flatnonzero(known) + 1, "nees": nees})
 
 

@@ -249,7 +249,7 @@ def near_far_mix(study: cs.Study) -> cs.Finding:
 
 def log_nees(curves: cs.Record) -> Array:
     """log of the mean NEES of each run (runs,), NaN where it failed."""
-    nees = curves.in_world.nees
+    nees = curves.in_world.errors.nees
     assert nees is not None
     value: Array = np.log(np.nanmean(nees, axis=1))
     return value
@@ -281,10 +281,10 @@ def outcomes(cases: Mapping[str, tuple[cs.Verdict, cs.Record]]) -> pd.DataFrame:
 def first_run(record: cs.Record) -> pd.DataFrame:
     """Errors of the first run and their stated standard deviations in each step, m and degrees."""
     world, scale = record.in_world, np.array([1.0, 1.0, np.degrees(1.0)])
-    assert world.error is not None
-    assert world.covariance is not None
-    error = scale * world.error[0]
-    sigma = scale * np.sqrt(np.maximum(np.diagonal(world.covariance[0], axis1=-2, axis2=-1), 0.0))
+    assert world.errors.error is not None
+    assert world.errors.covariance is not None
+    error = scale * world.errors.error[0]
+    sigma = scale * np.sqrt(np.maximum(np.diagonal(world.errors.covariance[0], axis1=-2, axis2=-1), 0.0))
     columns = {name: error[:, k] for k, name in enumerate(POSE)}
     bounds = {f"sigma_{name}": sigma[:, k] for k, name in enumerate(POSE)}
     return pd.DataFrame({"step": np.arange(1, len(error) + 1), **columns, **bounds})

@@ -179,9 +179,9 @@ def costs(scenario: cs.Scenario, seed: int) -> dict[str, float]:
 
 def row(verdict: cs.Verdict, record: cs.Record, beside: Array, cost: float) -> tuple[dict[str, Any], Array]:
     """Numbers of one filter; ``beside`` (runs,) are log RMSE of another, ``cost`` is in ms a step."""
-    assert record.nees is not None
-    steps = record.nees.shape[1]
-    nees = np.stack([mean_nees_of_runs(record), record.nees[:, -(steps // 10) :].mean(axis=1)]) / 3.0
+    assert record.errors.nees is not None
+    steps = record.errors.nees.shape[1]
+    nees = np.stack([mean_nees_of_runs(record), record.errors.nees[:, -(steps // 10) :].mean(axis=1)]) / 3.0
     value, low, high = mean_of(nees[0], SURELY)
     rmse, rmse_low, rmse_high = np.exp(mean_of(log_rmse(record, (0, 1)) - beside))
     numbers = {

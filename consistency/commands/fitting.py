@@ -165,7 +165,7 @@ def correct_command(
     record = the_record(records, name).without_first(skip_asked(skip))
     texts = text_files(path, files, record.name)
     names = None
-    if len(texts) == len(record.run_numbers) and record.unit == "run" and texts[0].run_column is None:
+    if len(texts) == len(record.run_numbers) and record.runs.unit == "run" and texts[0].run_column is None:
         names = [texts[run].path.stem for run in record.run_numbers]
     found = correct(record, held_out=held_out, per_axis=per is not None, names=names)
     tell_notes(records)

@@ -105,7 +105,13 @@ def read_files(path: Path, files: Reading) -> list[Record]:
 def tell_notes(*read: list[Record]) -> None:
     """What was assumed and left out, to standard error; said when nothing is refused any more."""
     tell(
-        dict.fromkeys(note for recordings in read for one in recordings for note in one.notes if note not in one.causes)
+        dict.fromkeys(
+            note
+            for recordings in read
+            for one in recordings
+            for note in one.origin.notes
+            if note not in one.origin.causes
+        )
     )
 
 

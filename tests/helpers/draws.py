@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import stats
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 
 
 def independent(rng, runs, steps, n):
@@ -37,7 +37,7 @@ def identities(error):
 
 def verdict_on(error, covariance=None, **settings):
     """The verdict on errors with covariance I, or the one given."""
-    return judge(Record("f", error, identities(error) if covariance is None else covariance), Settings(**settings))
+    return judge(make_record("f", error, identities(error) if covariance is None else covariance), Settings(**settings))
 
 
 def errs_at_most(rate, draws, errs, sure=1e-5):

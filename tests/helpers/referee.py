@@ -2,7 +2,7 @@
 
 from dataclasses import fields
 
-from consistency.diagnostics import Record, Settings
+from consistency.diagnostics import Settings, make_record
 from consistency.diagnostics import judge as judge_evidence
 
 OF_SETTINGS = {field.name for field in fields(Settings)}
@@ -11,4 +11,4 @@ OF_SETTINGS = {field.name for field in fields(Settings)}
 def judge(name, error=None, covariance=None, **options):
     """``judge(Record(name, ...), Settings(...))``."""
     settings = {key: options.pop(key) for key in OF_SETTINGS & set(options)}
-    return judge_evidence(Record(name, error, covariance, **options), Settings(**settings))
+    return judge_evidence(make_record(name, error, covariance, **options), Settings(**settings))

@@ -23,9 +23,9 @@ def test_a_table_has_the_errors_that_were_written(tmp_path):
     expected = (inputs.normal(inputs.RUNS * inputs.STEPS, 3) @ np.linalg.cholesky(inputs.P).T).reshape(
         inputs.RUNS, inputs.STEPS, 3
     )
-    assert_allclose(record.error, expected, atol=1e-11)
-    assert_allclose(record.covariance[3, 2], inputs.P, atol=1e-13)
-    assert record.axes == ("x", "y", "heading")
+    assert_allclose(record.errors.error, expected, atol=1e-11)
+    assert_allclose(record.errors.covariance[3, 2], inputs.P, atol=1e-13)
+    assert record.errors.axes == ("x", "y", "heading")
     assert cs.judge(record).status == "consistent"
 
 
@@ -33,7 +33,7 @@ def test_a_table_has_the_errors_that_were_written(tmp_path):
 def test_a_trajectory_in_space(scale, status, tmp_path):
     est, true, cov = inputs.trajectories(tmp_path, scale)
     record = cs.read(est, truth=true, covariance=cov, time_offset=0.0)
-    assert_allclose(record.error[0, 0, :3], scale * np.array([0.1, 0.2, 0.05]) * inputs.normal(1, 3)[0])
+    assert_allclose(record.errors.error[0, 0, :3], scale * np.array([0.1, 0.2, 0.05]) * inputs.normal(1, 3)[0])
     assert cs.judge(record).status == status
 
 
@@ -46,8 +46,8 @@ def test_a_trajectory_in_another_world(align, tmp_path):
         rows[:, 1:4] = turn.apply(rows[:, 1:4]) + shift
         rows[:, 4:] = (turn * Rotation.from_quat(rows[:, 4:])).as_quat()
         np.savetxt(path, rows, fmt="%.17g")
-    assert np.abs(cs.read(est, truth=true, covariance=cov, axes=["x", "y", "z"]).error).max() > 1.0
-    assert np.nanmax(np.abs(cs.read(est, truth=true, covariance=cov, align=align).error)) < 1.0
+    assert np.abs(cs.read(est, truth=true, covariance=cov, axes=["x", "y", "z"]).errors.error).max() > 1.0
+    assert np.nanmax(np.abs(cs.read(est, truth=true, covariance=cov, align=align).errors.error)) < 1.0
 
 
 def test_a_state_of_other_columns(tmp_path):
@@ -55,8 +55,8 @@ def test_a_state_of_other_columns(tmp_path):
     inputs.rows(tmp_path / "est.csv", "step,bias,P_bias_bias", lines)
     inputs.rows(tmp_path / "true.csv", "step,bias", [[k, 0.0] for k in range(50)])
     record = cs.read(tmp_path / "est.csv", truth=tmp_path / "true.csv", state=["bias"])
-    assert record.axes == ("bias",)
-    assert_allclose(record.error[0, :, 0], -inputs.normal(50, 1)[:, 0], atol=1e-11)
+    assert record.errors.axes == ("bias",)
+    assert_allclose(record.errors.error[0, :, 0], -inputs.normal(50, 1)[:, 0], atol=1e-11)
 
 
 @pytest.mark.parametrize("column, value", [("x", "nan"), ("heading", "inf"), ("heading", "nan")])

@@ -14,9 +14,10 @@ import pytest
 from draws import autoregression, fully_dependent, identities, independent, verdict_on
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from records import changed
 from scipy import stats
 
-from consistency.diagnostics import Interval, Record, Settings, judge
+from consistency.diagnostics import Interval, Settings, judge, make_record
 from consistency.referee.diagnostics.questions.tails import outliers
 from consistency.referee.diagnostics.verdict.parts import STATUSES
 from consistency.referee.diagnostics.verdict.verdict import plain
@@ -88,20 +89,23 @@ def test_failures_are_failed_unless_a_fault_is_found(rng):
     for ratio, status in ((1.0, "failed"), (4.0, "overconfident")):
         error = np.sqrt(ratio) * independent(rng, 60, 20, 3)
         error[3, 6:] = np.nan
-        verdict = judge(Record("f", error, identities(error), failures=broke), Settings(SURE))
+        verdict = judge(make_record("f", error, identities(error), failures=broke), Settings(SURE))
         assert verdict.status == status
         assert "1 of 60 runs failed, first run 3 in step 7: LinAlgError: singular" in verdict.reasons[0]
-    others = judge(Record("f", error / 2.0, identities(error), failures=broke), Settings(SURE))
+    others = judge(make_record("f", error / 2.0, identities(error), failures=broke), Settings(SURE))
     assert others.reasons[1].startswith("no other fault found in 60 runs")
     whole = (Failure("f", 3, 1, "time-out after 1 s"),)
-    hung = judge(Record("f", error / 2.0, identities(error), failures=whole), Settings(SURE))
+    hung = judge(make_record("f", error / 2.0, identities(error), failures=whole), Settings(SURE))
     assert hung.reasons[0] == "failed: 1 of 60 runs failed, first run 3: time-out after 1 s"
     assert fragment(Reasons((reason(hung),))).startswith("f failed: 1 of 60 runs failed")
     lost = (Failure("f", 99, 7, "KeyError: 3"),)  # a run without a map, beside 60 with one
-    of_map = judge(Record("f", error / 2.0, identities(error), failures=lost, landmarks=np.arange(20)), Settings(SURE))
+    of_map = judge(
+        changed(make_record("f", error / 2.0, identities(error), failures=lost), landmarks=np.arange(20)),
+        Settings(SURE),
+    )
     assert of_map.reasons[0] == "failed: 1 of 61 runs failed, first run 99 in step 7: KeyError: 3"
     single = independent(rng, 1, 20, 3)
-    assert judge(Record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
+    assert judge(make_record("f", single, identities(single), failures=broke), Settings(SURE)).status == "failed"
 
 
 def test_statuses_of_alarm_have_a_fault_and_the_others_none(rng):
@@ -172,7 +176,7 @@ def test_a_fault_from_the_start_has_no_date(rng):
 def test_the_chief_axis_has_the_name_it_was_given(rng):
     error = independent(rng, 61, 20, 3)
     error[..., 2] *= np.sqrt(3.0)
-    evidence = Record("f", error, identities(error), axes=["x", "y", "heading"])
+    evidence = make_record("f", error, identities(error), axes=["x", "y", "heading"])
     verdict = judge(evidence, Settings(SURE))
     assert verdict.subset == "heading"
     assert "heading" in verdict.reasons[0]
@@ -302,7 +306,7 @@ def sentences(kind):
     for runs in RUNS:
         for error in kind(rng, runs):
             for settings in (Settings(), Settings(allow="conservative"), Settings(1e-4, tolerance=1.2)):
-                verdict = judge(Record("f", error, identities(error)), settings)
+                verdict = judge(make_record("f", error, identities(error)), settings)
                 assert verdict.status in STATUSES
                 texts.append((verdict.reasons[0], runs))
     return texts
@@ -357,11 +361,11 @@ def test_correlations_that_look_the_same_are_not_named(rng):
     stated, true = (np.array([[1.0, c], [c, 1.0]]) for c in (0.68, 0.70))
     error = independent(rng, 4000, 40, 2) @ np.linalg.cholesky(true).T
     covariance = np.broadcast_to(stated, (4000, 40, 2, 2))
-    verdict = judge(Record("f", error, covariance), Settings())
+    verdict = judge(make_record("f", error, covariance), Settings())
     assert "shape" in verdict.faults
     assert "correlation" not in verdict.reasons[0]
     error = independent(rng, 400, 40, 2) @ np.linalg.cholesky(np.array([[1.0, 0.9], [0.9, 1.0]])).T
-    far = judge(Record("f", error, covariance[:400]), Settings())
+    far = judge(make_record("f", error, covariance[:400]), Settings())
     assert "correlation +0.90, stated +0.68" in far.reasons[0]
 
 
@@ -369,7 +373,7 @@ def test_one_run_that_failed_is_said_in_the_singular(rng):
     error = independent(rng, 40, 10, 2)
     covariance = identities(error).copy()
     covariance[3, 4] = -np.eye(2)
-    verdict = judge(Record("f", error, covariance), Settings(SURE))
+    verdict = judge(make_record("f", error, covariance), Settings(SURE))
     assert verdict.status == "failed"
     assert "1 of 40 runs has " in verdict.reasons[0]
 
@@ -420,7 +424,7 @@ def test_print_is_short(rng):
 def test_html_escapes_what_others_named(rng):
     hostile = "<script>alert('x')</script>&\""
     error = 3.0 * independent(rng, 20, 5, 2)
-    evidence = Record(hostile, error, identities(error), axes=["<b>x", "y&z"],
+    evidence = make_record(hostile, error, identities(error), axes=["<b>x", "y&z"],
                         failures=(Failure("f", 1, 2, "<img src=x>"),))  # fmt: skip
     html = judge(evidence, Settings())._repr_html_()
     for bad in ("<script", "<b>x", "<img"):
@@ -451,13 +455,13 @@ def test_statistics_have_every_key_that_files_have_had(rng):
     P, nees = identities(error), np.square(error).sum(axis=-1)
     nis = {"nis": rng.chisquare(2, (40, 12)), "nis_dof": np.full((40, 12), 2)}
     cases = [
-        (judge(Record("f", error, P)), OF_ERRORS | OF_SHAPE),
-        (judge(Record("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
-        (judge(Record("f", error, P), Settings(allow="conservative")), OF_ERRORS),
-        (judge(Record("f", error, P, **nis)), OF_ERRORS | OF_SHAPE | OF_INNOVATIONS),
-        (judge(Record("f", nees=nees, dof=3)), KEYS),
-        (judge(Record("f", **nis)), OF_ANY | OF_INNOVATIONS),
-        (judge(Record("f", **nis, optimal_gain=True)), OF_ANY | OF_INNOVATIONS),
+        (judge(make_record("f", error, P)), OF_ERRORS | OF_SHAPE),
+        (judge(make_record("f", error + 1.0, P)), OF_ERRORS | OF_SHAPE | {"ratio_without_bias", "bias_axis"}),
+        (judge(make_record("f", error, P), Settings(allow="conservative")), OF_ERRORS),
+        (judge(make_record("f", error, P, **nis)), OF_ERRORS | OF_SHAPE | OF_INNOVATIONS),
+        (judge(make_record("f", nees=nees, dof=3)), KEYS),
+        (judge(make_record("f", **nis)), OF_ANY | OF_INNOVATIONS),
+        (judge(make_record("f", **nis, optimal_gain=True)), OF_ANY | OF_INNOVATIONS),
     ]
     for verdict, keys in cases:
         s = verdict.statistics
@@ -472,7 +476,7 @@ def test_statistics_are_the_numbers_of_the_arrays(rng):
     """The flat names mean what they say: nothing swapped between the parts."""
     error = np.sqrt(1.3) * independent(rng, 40, 12, 3)
     nees = np.square(error).sum(axis=-1)
-    v = judge(Record("f", error, identities(error), axes=["x", "y", "heading"]), Settings(0.01))
+    v = judge(make_record("f", error, identities(error), axes=["x", "y", "heading"]), Settings(0.01))
     s, means = v.statistics, nees.mean(axis=1)
     assert (s["false_alarm"], s["confidence"], s["runs"], s["steps"]) == (0.01, 0.99, 40, 12)
     assert s["mean_anees"] == pytest.approx(nees.mean())
@@ -569,29 +573,31 @@ def test_innovations_of_no_declared_gain_change_nothing(seed, size, runs, steps,
     rng = np.random.default_rng(seed)
     error = np.sqrt(ratio) * independent(rng, runs, steps, 2)
     nis = {"nis": size * rng.chisquare(2, (runs, steps)), "nis_dof": np.full((runs, steps), 2)}
-    alone = judge(Record("f", error, identities(error)))
-    beside = judge(Record("f", error, identities(error), **nis))
+    alone = judge(make_record("f", error, identities(error)))
+    beside = judge(make_record("f", error, identities(error), **nis))
     assert (alone.status, alone.faults, alone.answers) == (beside.status, beside.faults, beside.answers)
     assert alone.reasons[0] == beside.reasons[0]
     assert not beside.innovations.judged
-    only = judge(Record("f", **nis))
+    only = judge(make_record("f", **nis))
     assert (only.status, only.answers) == ("undecided", ())
 
 
 def test_innovations_of_a_declared_gain_count(rng):
     error = independent(rng, 60, 20, 2)
     nis = {"nis": 2.0 * rng.chisquare(2, (60, 20)), "nis_dof": np.full((60, 20), 2)}
-    verdict = judge(Record("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
+    verdict = judge(make_record("f", error, identities(error), optimal_gain=True, **nis), Settings(SURE))
     assert verdict.faults == ("innovation scale",)
     assert verdict.status == "inconsistent"
     size = f"innovations larger than stated (NIS per degree of freedom {short(verdict.innovations.ratio)})"
     assert verdict.reasons[0] == f"inconsistent: {size}"
-    only = judge(Record("f", optimal_gain=True, **nis), Settings(SURE))
+    only = judge(make_record("f", optimal_gain=True, **nis), Settings(SURE))
     assert only.reasons[0] == f"overconfident: {size}; no truth: most pose errors cannot be seen"
     u = independent(rng, 60, 20, 2)
     u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
     correlated = judge(
-        Record("f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True),
+        make_record(
+            "f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True
+        ),
         Settings(SURE),
     )
     assert "innovation whiteness" in correlated.faults
@@ -632,7 +638,7 @@ def evidence(draw):
             covariance[:, k] = 0.0
     nis, nis_dof = rng.chisquare(2, (runs, steps)), rng.integers(0, 3, (runs, steps))
     given_nis = draw(st.booleans())
-    return Record(
+    return make_record(
         "f", error, covariance, nis=nis if given_nis else None, nis_dof=nis_dof if given_nis else None,
         optimal_gain=draw(st.booleans()),
     )  # fmt: skip
@@ -640,8 +646,8 @@ def evidence(draw):
 
 def only_one_run_errs(evidence):
     """What the next test is for."""
-    assert evidence.error is not None
-    return int((np.nan_to_num(evidence.error) != 0.0).any(axis=(1, 2)).sum()) == 1
+    assert evidence.errors.error is not None
+    return int((np.nan_to_num(evidence.errors.error) != 0.0).any(axis=(1, 2)).sum()) == 1
 
 
 @pytest.mark.parametrize("runs", [2, 25])
@@ -687,5 +693,7 @@ def test_there_is_a_verdict_on_anything(given_, settings):
     assert str(verdict)
     assert verdict._repr_html_()
     json.dumps(plain(verdict.statistics), allow_nan=False)
-    only = judge(Record("f", nees=np.square(given_.error).sum(axis=-1), dof=given_.error.shape[-1]), settings)
+    only = judge(
+        make_record("f", nees=np.square(given_.errors.error).sum(axis=-1), dof=given_.errors.error.shape[-1]), settings
+    )
     assert only.status in STATUSES

@@ -89,7 +89,7 @@ def _study(folder: Path, index: int, styles: dict[str, int]) -> Study:
         summary=scenario.summary if scenario else "Recorded log",
         runs=len(runs),
         shown_run=shown_run,
-        clock=time_axis_of(tracks[0].shown.t if tracks else np.full(steps, np.nan)),
+        clock=time_axis_of(tracks[0].shown.runs.t if tracks else np.full(steps, np.nan)),
         steps=np.arange(1, steps + 1),
         tracks=tracks,
         results=results,

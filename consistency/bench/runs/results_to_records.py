@@ -20,7 +20,18 @@ from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
 from consistency.referee.diagnostics.questions import scale
 from consistency.referee.diagnostics.questions.planning import Design, sequential_design
-from consistency.referee.diagnostics.records.record import JointNees, MapRecord, Record, Rejections, Skip
+from consistency.referee.diagnostics.records.record import (
+    Errors,
+    InnovationRecord,
+    JointNees,
+    Map,
+    MapRecord,
+    Record,
+    Rejections,
+    Runs,
+    Skip,
+    TruthFit,
+)
 from consistency.referee.diagnostics.records.whitening import by_runs, by_steps
 from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
@@ -118,23 +129,26 @@ def record_of(results: Tables, filter_name: str, steps: int | None = None) -> Re
         for _, run, step, reason in failed_runs.itertuples(index=False)
     )
     dof = len(POSE) if results.has_truth else 0
-    record_with = partial(Record, filter_name, dof=dof, axes=POSE, runs=runs, align="")
     own_error = _errors(results, runs, pose.copy(), t, convention) if own_nees is not None else None
-    world = record_with(_errors(results, runs, pose, t) if results.has_truth else None, covariance, nees)
-    _require_agreement(world)
-    _require_all(world, "nees", covariance if own_covariance is None else own_covariance)
-    record = world
+    error = _errors(results, runs, pose, t) if results.has_truth else None
+    record = Record(
+        filter_name,
+        Errors(error, covariance, nees, dof, POSE),
+        InnovationRecord(nis, nis_dof, optimal_gain=filter_name in results.manifest.get("optimal_gain", [])),
+        Runs(runs, t=t),
+        failures,
+        fit=TruthFit(align=""),
+        map=Map(partial(map_of, results, filter_name, runs, failures), _rejections(results, filter_name)),
+    )
+    _require_agreement(record)
+    _require_all(record, "nees", covariance if own_covariance is None else own_covariance)
     if own_covariance is not None:
-        record = record_with(own_error, own_covariance, own_nees, convention=convention, world=world)
+        own_errors = Errors(own_error, own_covariance, own_nees, dof, POSE, convention=convention)
+        record = replace(record, errors=own_errors, world=record.errors)
         _require_agreement(record)
         _require_all(record, "own_nees", own_covariance)
     _require_nis(filter_name, runs, nis, nis_dof)
-    return replace(
-        record, nis=nis, nis_dof=nis_dof, failures=failures, t=t,
-        optimal_gain=filter_name in results.manifest.get("optimal_gain", []),
-        map=partial(map_of, results, filter_name, runs, failures),
-        rejections=_rejections(results, filter_name),
-    )  # fmt: skip
+    return record
 
 
 def _places_of(runs: Indices, steps: int, batch: Columns) -> Any:
@@ -160,7 +174,7 @@ def _require_own(batch: Columns, filter_name: str) -> None:
 
 def _require_agreement(r: Record) -> None:
     """Refuse an error of so many standard deviations that no NEES can go with it: its square would overflow."""
-    if r.error is None or r.covariance is None or r.nees is None:
+    if r.errors.error is None or r.errors.covariance is None or r.errors.nees is None:
         return
 
     def beyond(error: Array, covariance: Array, nees: Array) -> Array:
@@ -168,7 +182,7 @@ def _require_agreement(r: Record) -> None:
         too_large = np.abs(error) > np.sqrt(LARGEST_NUMBER * np.maximum(variance, 0.0))
         return np.asarray(np.isfinite(nees) & (too_large & (variance > 0)).any(axis=-1))
 
-    impossible = by_runs(beyond, r.error, r.covariance, r.nees)
+    impossible = by_runs(beyond, r.errors.error, r.errors.covariance, r.errors.nees)
     if impossible.any():
         run_row, step = np.argwhere(impossible)[0]
         raise InputError(
@@ -179,13 +193,13 @@ def _require_agreement(r: Record) -> None:
 
 def _require_all(r: Record, column: str, covariance: Array) -> None:
     """Refuse a missing NEES from the first step on whose covariance, of the filter's own error, has full rank."""
-    if r.nees is None:
+    if r.errors.nees is None:
         return
     from consistency.bench.filters.kernel.linalg import definiteness  # loads Numba
 
     steps = np.isfinite(covariance[..., 0, 0]).sum(axis=1)  # with an estimate, of each run
-    first = by_runs(_first_number, r.nees)
-    missing = np.isfinite(r.nees).sum(axis=1) < steps - np.minimum(first, steps)
+    first = by_runs(_first_number, r.errors.nees)
+    missing = np.isfinite(r.errors.nees).sum(axis=1) < steps - np.minimum(first, steps)
     for row in np.flatnonzero((first > 0) & (steps > 0)):  # the last step without a NEES before those with one
         last = min(int(first[row]), int(steps[row])) - 1
         missing[row] |= definiteness(covariance[row, last]) == 1
@@ -281,18 +295,11 @@ def map_of(
         if last is not None and joint is not None:
             pose_nees = last[np.searchsorted(of_poses, runs)]
             joint_nees = _joint(pose_nees, joint[judged_rows], dof, row, column, landmarks_kept)
-        return Record(
-            filter_name,
-            errors[:, at] if has_errors else None,
-            covariances[:, at] if has_errors else None,
-            nees[:, at],
-            dof,
-            failures=failures,
-            axes=POINT[:dof],
-            runs=runs,
-            landmarks=labels[landmarks_kept],
-            joint=joint_nees,
-        )
+        own = Errors(nees=nees[:, at], dof=dof, axes=POINT[:dof])
+        if has_errors:
+            own = replace(own, error=errors[:, at], covariance=covariances[:, at])
+        of_map = Map(landmarks=labels[landmarks_kept], joint=joint_nees)
+        return Record(filter_name, own, runs=Runs(runs), failures=failures, map=of_map)
 
     return MapRecord(rows["run"], rows["nees"], dof, record)
 
@@ -395,7 +402,7 @@ def innovations_of(folder: Path, filter_name: str | None, run: int | None) -> Ni
 
 def log_rmse(of: Record, axes: Sequence[int]) -> Array:
     """log RMSE of some axes of the pose together in each run, in the world, shape (R,); NaN where it failed."""
-    error = of.in_world.error
+    error = of.in_world.errors.error
     assert error is not None
     value: Array = 0.5 * np.log(np.square(error[:, :, list(axes)]).sum(axis=2).mean(axis=1))
     return value
@@ -403,8 +410,8 @@ def log_rmse(of: Record, axes: Sequence[int]) -> Array:
 
 def mean_nees_of_runs(of: Record) -> Array:
     """Mean NEES of each run over its judged steps, in the filter's own error, shape (R,); infinite for a failed run."""
-    assert of.nees is not None
-    means, count = scale.run_means(of.nees)
+    assert of.errors.nees is not None
+    means, count = scale.run_means(of.errors.nees)
     means[count == 0] = np.inf
     means[np.isin(of.run_numbers, [failure.run for failure in of.failures])] = np.inf
     return np.asarray(means)
@@ -412,9 +419,9 @@ def mean_nees_of_runs(of: Record) -> Array:
 
 def nis_ratio(of: Record, runs: int) -> Array:
     """NIS of the first ``runs`` runs over their degrees of freedom in each step, (T,)."""
-    assert of.nis is not None
-    assert of.nis_dof is not None
-    return by_steps(_ratio, of.nis[:runs], of.nis_dof[:runs])
+    assert of.innovations.nis is not None
+    assert of.innovations.nis_dof is not None
+    return by_steps(_ratio, of.innovations.nis[:runs], of.innovations.nis_dof[:runs])
 
 
 def _ratio(nis: Array, nis_dof: Array) -> Array:

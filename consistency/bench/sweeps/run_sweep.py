@@ -428,10 +428,10 @@ def result_of(verdict: Verdict, cost: float, step_us: float) -> CellResult:
 
 def runs_table(record: Record) -> pd.DataFrame:
     """A row for each run: mean NEES, RMSE of position (m) and heading (rad) in judged steps, and failure."""
-    error, runs = record.in_world.error, record.run_numbers
+    error, runs = record.in_world.errors.error, record.run_numbers
     assert error is not None
-    assert record.nees is not None
-    squared_errors = np.where(np.isfinite(record.nees)[..., None], error**2, np.nan)
+    assert record.errors.nees is not None
+    squared_errors = np.where(np.isfinite(record.errors.nees)[..., None], error**2, np.nan)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mean of empty slice")  # a run without an estimate
         mean_squares = np.nanmean(squared_errors, axis=1)

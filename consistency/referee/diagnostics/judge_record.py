@@ -67,15 +67,15 @@ def judge(
         return _judge_conventions(record, settings, kept)
     evidence = record.as_runs
     truth = None
-    unshown = record.unshown
-    if record.truth_covariance is not None:
+    unshown = record.origin.unshown
+    if record.truth.covariance is not None:
         from consistency.referee.diagnostics.questions.uncertain_truth import uncertain_truth
 
         truth = uncertain_truth(record)
     if truth is not None:
         evidence = truth.evidence
-        unshown = record.unshown or truth.unjudged
-    if evidence.parts:
+        unshown = record.origin.unshown or truth.unjudged
+    if evidence.errors.parts:
         from consistency.referee.diagnostics.judging.record_findings import findings_of_parts
 
         found = findings_of_parts(evidence, settings, unshown)
@@ -100,23 +100,23 @@ def _verdict(found: Findings, sentences: Sequence[str], **beside: Any) -> Verdic
 def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
     """The verdict on a record: its findings in words, and what stands beside its errors and innovations."""
     sentence, *figures = reasons(found)
-    if judged.caption:
-        sentence = f"{sentence}; {judged.caption}"
+    if judged.fit.caption:
+        sentence = f"{sentence}; {judged.fit.caption}"
     convention = align = None
-    if judged.convention:
-        convention = judged.convention
-        align = judged.align or None
+    if judged.errors.convention:
+        convention = judged.errors.convention
+        align = judged.fit.align or None
     left_out = set(found.left_out_steps)
-    if judged.align:
+    if judged.fit.align:
         left_out.update(judged.left_out_steps)
-    causes = (*judged.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
+    causes = (*judged.origin.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
     return _verdict(
         found,
         [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)],
         left_out_steps=tuple(sorted(left_out)),
         convention=convention,
         align=align,
-        notes=tuple(judged.notes),
+        notes=tuple(judged.origin.notes),
         causes=causes,
         **beside,
     )
@@ -142,7 +142,7 @@ def _same_truth(record: Record, found: Findings) -> list[str]:
 
 def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
     """Probable mix-ups of the innovations; their modules are loaded for a record that has some."""
-    if record.nis is None and record.innovations is None:
+    if record.innovations.nis is None and record.innovations.values is None:
         return []
     from consistency.referee.diagnostics.questions.whiteness import innovation_causes, nis_and_dof
 
@@ -157,9 +157,9 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
 
 def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None:
     """Score of the maps, which are read for it, with the verdict on them; without settings the score alone."""
-    if record.map is None:
+    if record.map.read is None:
         return None
-    landmarks = record.map()
+    landmarks = record.map.read()
     if landmarks is None:
         return None
     from consistency.referee.diagnostics.questions.maps import last_nees, map_score
@@ -177,11 +177,11 @@ def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None
 
 def _rejections_of(record: Record, runs: int | None = None) -> RejectionScore | None:
     """What a guard rejected in the first runs, or in all."""
-    if record.rejections is None:
+    if record.map.rejections is None:
         return None
     from consistency.referee.diagnostics.questions.maps import rejection_score
 
-    _, *counts = record.rejections.of_runs(runs)
+    _, *counts = record.map.rejections.of_runs(runs)
     return rejection_score(*counts)
 
 
@@ -208,9 +208,9 @@ def _judge_conventions(record: Record, settings: Settings, kept: Record | None) 
     results = {}
     for kind, verdict in verdicts.items():
         runs = record.guesses[kind].as_runs
-        assert runs.nees is not None
-        means, counts = run_means(runs.nees)
-        ratio = ratio_interval(means[counts > 0] / runs.dof, runs.dof, confidence)
+        assert runs.errors.nees is not None
+        means, counts = run_means(runs.errors.nees)
+        ratio = ratio_interval(means[counts > 0] / runs.errors.dof, runs.errors.dof, confidence)
         possible = not verdict.faults and verdict.status != "failed"
         results[kind] = ConventionResult(verdict.status, verdict.faults, ratio, possible)
     first = next(iter(verdicts.values()))
@@ -220,7 +220,7 @@ def _judge_conventions(record: Record, settings: Settings, kept: Record | None) 
         "answers": (),
         "guesses": results,
         "convention": None,
-        "notes": tuple(record.notes),
+        "notes": tuple(record.origin.notes),
         "reasons": tuple(sentences_of_conventions(results, verdicts, settings)),
         "record": kept,
     }
@@ -313,7 +313,10 @@ def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept:
     """The verdict of a look at the first ``runs``, with what is known beside them."""
     world = None
     if evidence.world is not None:
-        errors = replace(evidence.in_world, map=None, rejections=None, caption="", causes=(), notes=(), convention="")
+        of_world = evidence.in_world.errors_alone
+        errors = replace(
+            of_world, fit=replace(of_world.fit, caption=""), origin=replace(of_world.origin, causes=(), notes=())
+        )
         world, _ = follow(design, errors.first_runs, runs)
     return _whole(
         evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs), record=kept

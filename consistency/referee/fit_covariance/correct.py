@@ -18,7 +18,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
-from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.record import Map, Record, numbered_axes
 from consistency.referee.diagnostics.records.whitening import squared_length, whiten
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
@@ -61,12 +61,12 @@ class HeldOut:
         """Ratio of true to stated covariance of each run, (R,); NaN of one without a step."""
         _, _, nees = stated_errors(self.record)
         means, counts = run_means(nees)
-        return np.where(counts > 0, means, np.nan) / self.record.dof
+        return np.where(counts > 0, means, np.nan) / self.record.errors.dof
 
     def covered(self, levels: Sequence[float] | Array) -> Array:
         """Share of the errors inside the ellipsoid of each probability, mean over runs."""
         _, _, nees = stated_errors(self.record)
-        bounds = special.chdtri(self.record.dof, 1.0 - np.asarray(levels))
+        bounds = special.chdtri(self.record.errors.dof, 1.0 - np.asarray(levels))
         return np.array([average(np.where(np.isfinite(nees), nees <= bound, np.nan)) for bound in bounds])
 
 
@@ -106,12 +106,12 @@ class Correction:
     @property
     def axes(self) -> tuple[str, ...]:
         """Names of the components of the error."""
-        return tuple(self.before.record.axes) or numbered_axes(self.before.record.dof)
+        return tuple(self.before.record.errors.axes) or numbered_axes(self.before.record.errors.dof)
 
     @property
     def unit(self) -> str:
         """What a run is called."""
-        return self.before.record.unit
+        return self.before.record.runs.unit
 
     @property
     def needed(self) -> int | None:
@@ -183,11 +183,11 @@ def correct(
     labels = tuple(map(str, record.run_numbers if names is None else names))
     counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
-    blocks = blocks_of(record.axes, record.dof, per_axis)
+    blocks = blocks_of(record.errors.axes, record.errors.dof, per_axis)
     fits = fit_groups(record.of_runs(fitted), blocks)
     place = {run: row for row, run in enumerate(fitted)}
     used = tuple(by_group(fits, place.get(run)) for run in judged)
-    some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
+    some = replace(record, map=Map(), world=None).of_runs(judged)
     before = held_out_by(some)
     after = held_out_by(with_factors(some, used))
     dof = np.array([fit.dof for fit in fits.values()])
@@ -227,7 +227,7 @@ def the_record(records: Sequence[Record], name: str | None = None) -> Record:
 
 def require_runs(record: Record) -> None:
     """Refuse a record that has no covariances, or one run alone."""
-    if record.error is None or record.covariance is None or record.nees is None:
+    if record.errors.error is None or record.errors.covariance is None or record.errors.nees is None:
         raise InputError(f"{record.name}: needs errors and covariances, of files with a truth")
     if record.groups is not None and record.groups.outcome:
         raise InputError(
@@ -236,7 +236,7 @@ def require_runs(record: Record) -> None:
         )
     if record.guesses:
         raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
-    runs = int(np.isfinite(record.nees).any(axis=1).sum())
+    runs = int(np.isfinite(record.errors.nees).any(axis=1).sum())
     if runs == 1:
         from consistency.referee.diagnostics.questions.planning import FEWEST
 
@@ -279,7 +279,7 @@ def fit_groups(record: Record, blocks: tuple[FactorBlock, ...]) -> dict[str, Fit
     asked = max(len(names), 1)
     for number, name in enumerate(names):
         of_group = np.where(group_index(record) == number, nees, np.nan)
-        some = replace(record, nees=of_group, groups=None)
+        some = replace(record.with_nees(of_group), groups=None)
         there = np.asarray(np.isfinite(of_group).any(axis=1))
         if there.sum() < 2:
             fits[name] = replace(whole, notes=(f"{name}: fewer than two runs; the factors are those of all steps",))
@@ -335,7 +335,7 @@ def with_covariance(record: Record, error: Array, P: Array) -> Record:
     """The record with other errors and covariances where it had some that count."""
     _, _, stated = stated_errors(record)
     nees = np.where(np.isfinite(stated), squared_length(whiten(error, P)), np.nan)
-    return replace(record, error=error, covariance=P, nees=nees)
+    return record.with_errors(error, P, nees)
 
 
 def with_uncertainty(record: Record, blocks: Sequence[FactorBlock], dof: Array) -> Record:
@@ -375,7 +375,7 @@ def held_out_by(record: Record) -> HeldOut:
         ratio = verdict.scale.inflation
     else:
         means, counts = run_means(nees)
-        ratio = ratio_interval(means[counts > 0] / record.dof, record.dof)
+        ratio = ratio_interval(means[counts > 0] / record.errors.dof, record.errors.dof)
     scores = [log_densities(error, P).mean() for error, P in steps_of_runs(record) if len(error)]
     return HeldOut(record, verdict, ratio, np.array(scores))
 
@@ -482,7 +482,7 @@ def data_of_correction(found: Correction) -> dict[str, Any]:
             "fitted_runs": found.fitted,
             "judged_runs": found.judged,
             "needed_runs": found.needed,
-            "convention": found.before.record.convention,
+            "convention": found.before.record.errors.convention,
             "excess": found.excess,
             "log_score_gain": found.gain,
             "by": groups.column if groups is not None else None,

@@ -131,10 +131,10 @@ def blocks_of(axes: Sequence[str], n: int, per_axis: bool) -> tuple[FactorBlock,
 
 def stated_errors(record: Record) -> tuple[Array, Array, Array]:
     """Errors (runs, steps, n), stated covariances and NEES (runs, steps) of a record that has them."""
-    assert record.error is not None
-    assert record.covariance is not None
-    assert record.nees is not None
-    return record.error, record.covariance, record.nees
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    assert record.errors.nees is not None
+    return record.errors.error, record.errors.covariance, record.errors.nees
 
 
 def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
@@ -146,8 +146,8 @@ def steps_of_runs(record: Record) -> Iterator[tuple[Array, Array]]:
 
 def run_weights(record: Record) -> Array:
     """Steps of each run that has any over their mean, (R,)."""
-    assert record.nees is not None
-    counts = np.isfinite(record.nees).sum(axis=1)
+    assert record.errors.nees is not None
+    counts = np.isfinite(record.errors.nees).sum(axis=1)
     counts = counts[counts > 0]
     return np.asarray(counts / counts.mean())
 

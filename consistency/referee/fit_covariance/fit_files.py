@@ -261,7 +261,7 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
     held_out = dict(zip(found.before.record.run_numbers.tolist(), found.used, strict=True))
     groups = record.groups
     is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
-    are_runs = record.unit == "run"  # pieces of one log are not in its file
+    are_runs = record.runs.unit == "run"  # pieces of one log are not in its file
     runs = record.run_numbers.tolist()
     if is_text and not are_runs:
         runs = [file.run for file in files]
@@ -318,11 +318,11 @@ def _write_archive(path: Path, record: Record, of_runs: dict[int, ByGroup]) -> N
     mask = ~counted
     for failure in some.failures:  # which stay failures
         mask[some.run_numbers == failure.run, failure.step - 1 :] = False
-    axes = np.array(list(record.axes) or [f"axis {i}" for i in range(record.dof)])
+    axes = np.array(list(record.errors.axes) or [f"axis {i}" for i in range(record.errors.dof)])
     np.savez(
         path,
         errors=error,
-        covariances=np.where(counted[..., None, None], P, np.eye(record.dof)),
+        covariances=np.where(counted[..., None, None], P, np.eye(record.errors.dof)),
         mask=mask,
         axes=axes,
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary
 from consistency.referee.diagnostics.questions.whiteness import nis_of
-from consistency.referee.diagnostics.records.record import Record, Skip, skip_of
+from consistency.referee.diagnostics.records.record import InnovationRecord, Record, Skip, skip_of
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.archives import steps_of
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
@@ -26,7 +27,6 @@ from consistency.referee.verdicts.judge_sources import Source
 if TYPE_CHECKING:
     from consistency.referee.verdicts.compare_sources import Baseline
 
-OF_RUNS = ("error", "covariance", "nees", "nis", "innovations", "innovation_covariances")  # (runs, steps, ...)
 NONE_FAILED = FailedRuns(0, 0)
 
 
@@ -72,17 +72,17 @@ def record_of_checked(
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
         record = record_of_arrays(stated, axes, name)
-        if nees is None and dof is not None and dof != record.dof:
-            raise ValueError(f"dof is {dof}, but the errors have {record.dof} components")
-    arrays, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
-    if not stated and not arrays:
+        if nees is None and dof is not None and dof != record.errors.dof:
+            raise ValueError(f"dof is {dof}, but the errors have {record.errors.dof} components")
+    of_gain, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
+    if not stated and of_gain.nis is None:
         raise ValueError("nothing to judge: give errors and covariances, or nees and dof, or nis and nis_dof")
     if not stated and not optimal_gain:
         raise ValueError(
             "innovations alone are judged only with optimal_gain=True: those of any other gain are not white, nor of "
             "the stated size, even if the filter is right"
         )
-    record = _ended(replace(record, **arrays, optimal_gain=optimal_gain), failures)
+    record = _ended(replace(record, innovations=replace(of_gain, optimal_gain=optimal_gain)), failures)
     try:
         return record.without_first(skip_of(skip))
     except InputError as error:
@@ -94,17 +94,17 @@ def planned_dof(record: Record) -> int:
 
     Those of the smallest part where components are judged by themselves.
     """
-    if record.parts:
-        return min(map(len, record.parts))
-    if record.dof or record.nis_dof is None:
-        return record.dof
-    return max(1, int(np.nansum(record.nis_dof, axis=1).min()))
+    if record.errors.parts:
+        return min(map(len, record.errors.parts))
+    if record.errors.dof or record.innovations.nis_dof is None:
+        return record.errors.dof
+    return max(1, int(np.nansum(record.innovations.nis_dof, axis=1).min()))
 
 
 def rate_shares(record: Record) -> int:
     """Parts that divide the false-alarm rate among them; see ``Record.parts``."""
-    shares = len(record.parts)
-    if shares and record.optimal_gain and record.nis is not None:
+    shares = len(record.errors.parts)
+    if shares and record.innovations.optimal_gain and record.innovations.nis is not None:
         shares += 1
     return max(shares, 1)
 
@@ -133,11 +133,11 @@ def record_of_filter(
 
 
 def _gone(record: Record) -> Array | None:
-    """Steps of runs from their failure on, (runs, steps) of bool; None without any array of runs."""
-    shapes = [array.shape[:2] for key in OF_RUNS if (array := getattr(record, key)) is not None]
-    if not shapes:
+    """Steps of runs from their failure on, (runs, steps) of bool; None without errors, NEES and NIS."""
+    some = next((a for a in (record.errors.error, record.errors.nees, record.innovations.nis) if a is not None), None)
+    if some is None:
         return None
-    gone = np.zeros(shapes[0], bool)
+    gone = np.zeros(some.shape[:2], bool)
     for failure in record.failures:
         gone[failure.run, failure.step - 1 :] = True
     return gone
@@ -153,18 +153,15 @@ def _ended(record: Record, failures: Sequence[Failure]) -> Record:
     record = replace(record, failures=tuple(first[run] for run in sorted(first)))
     gone = _gone(record)
     assert gone is not None
-    arrays: dict[str, Any] = {}
-    for key in OF_RUNS:
-        if (array := getattr(record, key)) is not None:
-            arrays[key] = _without(gone, array)
-    if record.nis_dof is not None:
-        arrays["nis_dof"] = np.where(gone, 0, record.nis_dof)
-    return replace(record, **arrays)
+
+    steps_alone = replace(record, runs=replace(record.runs, numbers=None))
+    return replace(steps_alone.changed(partial(_without, gone)), runs=record.runs)
 
 
 def _without(gone: Array, array: Array) -> Array:
-    """Values (runs, steps, ...), NaN in steps that are ``gone``."""
-    return np.where(gone.reshape(*gone.shape, *(1,) * (array.ndim - 2)), np.nan, array)
+    """Values (runs, steps, ...) without the steps that are ``gone``: NaN, and 0 of whole numbers."""
+    nothing = np.nan if array.dtype.kind == "f" else 0
+    return np.where(gone.reshape(*gone.shape, *(1,) * (array.ndim - 2)), nothing, array)
 
 
 def _require_some(name: str, there: Array, good: Array) -> None:
@@ -187,23 +184,22 @@ def _gone_of(name: str, shape: tuple[int, ...], gone: Array | None) -> Array:
 def _innovations(
     name: str, nis: ArrayLike | None, nis_dof: ArrayLike | None, vectors: ArrayLike | None,
     covariances: ArrayLike | None, gone: Array | None,
-) -> tuple[dict[str, Any], list[Failure]]:  # fmt: skip
-    """Innovations by their names in a record, without the steps that are ``gone``, and the runs that fail in them."""
+) -> tuple[InnovationRecord, list[Failure]]:  # fmt: skip
+    """Innovations without the steps that are ``gone``, and the runs that fail in them."""
     if (nis is None) != (nis_dof is None):
         raise ValueError("give nis and nis_dof together")
     if (vectors is None) != (covariances is None):
         raise ValueError("give innovations and innovation_covariances together")
-    arrays: dict[str, Any] = {}
+    found = InnovationRecord()
     failures: list[Failure] = []
     if vectors is not None and covariances is not None:
         v, S, failures = _vectors(name, vectors, covariances, gone)
-        arrays |= {"innovations": v, "innovation_covariances": S}
-        if nis is None:
-            arrays["nis"], arrays["nis_dof"] = nis_of(v, S)
+        found = InnovationRecord(*nis_of(v, S), v, S)
     if nis is not None and nis_dof is not None:
-        arrays["nis"], arrays["nis_dof"], more = _nis(name, nis, nis_dof, gone)
+        values, dof, more = _nis(name, nis, nis_dof, gone)
+        found = replace(found, nis=values, nis_dof=dof)
         failures += more
-    return arrays, failures
+    return found, failures
 
 
 def _vectors(
@@ -341,10 +337,10 @@ def of_arrays(name: str, candidate: Mapping[str, Any], reference: Mapping[str, A
     n = len(b.run_numbers)
     if m != n:
         raise ValueError(f"the candidate has {m} runs and the reference {n}; row i of both must be one trial")
-    if a.dof != b.dof:
-        raise ValueError(f"the errors have {a.dof} and {b.dof} components")
+    if a.errors.dof != b.errors.dof:
+        raise ValueError(f"the errors have {a.errors.dof} and {b.errors.dof} components")
     failures = FailedRuns(len(a.failures), len(b.failures))
-    return Sides(a, row_a, row_b, "the reference", tuple(a.axes) or None, paired=True, failures=failures)
+    return Sides(a, row_a, row_b, "the reference", tuple(a.errors.axes) or None, paired=True, failures=failures)
 
 
 def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunSummary]:
@@ -352,8 +348,8 @@ def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunS
         case = record_of_checked(name, **arrays)
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
-    assert case.nees is not None
-    return case, summary(case.nees, case.dof, case.error, case.covariance)
+    assert case.errors.nees is not None
+    return case, summary(case.errors.nees, case.errors.dof, case.errors.error, case.errors.covariance)
 
 
 def of_filters(

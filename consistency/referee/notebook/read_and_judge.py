@@ -197,22 +197,26 @@ def judge(
         record = with_groups(record, by, bins)
     record = record.without_first(skip_asked(skip))
     if optimal_gain:
-        record = replace(record, optimal_gain=True)
+        record = record.with_optimal_gain()
     return judge_record(record, settings_of(**settings), keep_record=True)
 
 
 def record_text(record: Record) -> str:
-    runs, unit = plural(len(record.run_numbers), "run"), "step" if record.window is None else "window"
-    size = f"{runs} x {plural(len(record.t), unit)}"
-    return f"<Record {record.name}: {size}, error {record.convention or '-'} of {', '.join(record.names)}>"
+    runs, unit = plural(len(record.run_numbers), "run"), "step" if record.origin.window is None else "window"
+    size = f"{runs} x {plural(len(record.runs.t), unit)}"
+    return (
+        f"<Record {record.name}: {size}, error {record.errors.convention or '-'} of {', '.join(record.errors.names)}>"
+    )
 
 
 def record_html(record: Record) -> str:
     rows = (
-        ("runs", str(len(record.run_numbers))), ("steps", str(len(record.t))), ("error", record.convention or "-"),
-        ("components", ", ".join(record.names)), ("failed runs", str(len(record.failures))),
+        ("runs", str(len(record.run_numbers))), ("steps", str(len(record.runs.t))),
+        ("error", record.errors.convention or "-"),
+        ("components", ", ".join(record.errors.names)), ("failed runs", str(len(record.failures))),
     )  # fmt: skip
-    return f"<div><strong>{escape(record.name)}</strong>{as_html.fragment(Facts(rows), Bullets(record.notes))}</div>"
+    shown = as_html.fragment(Facts(rows), Bullets(record.origin.notes))
+    return f"<div><strong>{escape(record.name)}</strong>{shown}</div>"
 
 
 def verdict_text(verdict: Verdict) -> str:
@@ -235,6 +239,7 @@ def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> An
     from consistency.referee.pages.record_figures import overview
     from consistency.referee.pages.write_pages import plotted
 
-    if record.error is not None and not record.axes:
-        record = replace(record, axes=numbered_axes(record.error.shape[-1]))
+    if record.errors.error is not None and not record.errors.axes:
+        axes = numbered_axes(record.errors.error.shape[-1])
+        record = replace(record, errors=replace(record.errors, axes=axes))
     return plotted(overview(record, verdict), path)

@@ -106,7 +106,7 @@ def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
         _nees(both, verdict), _errors_over_sigma(both), _worst_run(both), _errors(both), _trajectory(both),
         _coverage(both), _innovations(both, verdict),
     )  # fmt: skip
-    note = f" {OF_BOTH}" if record.truth_covariance is not None else ""
+    note = f" {OF_BOTH}" if record.truth.covariance is not None else ""
     return tuple(
         replace(picture, caption=picture.caption + note).figure() for picture in pictures if picture is not None
     )
@@ -142,7 +142,7 @@ def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Dra
 
 def has_one_step(record: Record) -> bool:
     """Whether a curve along the steps would be a point, and one along the runs is not."""
-    return len(record.t) == 1 and len(record.run_numbers) > 1
+    return len(record.runs.t) == 1 and len(record.run_numbers) > 1
 
 
 def _span_runs(axes: Axes, record: Record) -> None:
@@ -175,22 +175,22 @@ class Errors:
 
 def errors_of(record: Record) -> list[Errors]:
     """Of each component that is drawn."""
-    assert record.error is not None
-    assert record.covariance is not None
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
     found = []
-    for i, name in enumerate(record.names[:MOST_PANELS]):
-        unit, factor = unit_of(record.axes[i])
-        bound = SIGMAS * factor * np.sqrt(np.maximum(record.covariance[:, :, i, i], 0.0))
-        found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.error[..., i], bound))
+    for i, name in enumerate(record.errors.names[:MOST_PANELS]):
+        unit, factor = unit_of(record.errors.axes[i])
+        bound = SIGMAS * factor * np.sqrt(np.maximum(record.errors.covariance[:, :, i, i], 0.0))
+        found.append(Errors(f"{name} ({unit})" if unit else name, factor * record.errors.error[..., i], bound))
     return found
 
 
 def _errors(record: Record) -> Picture | None:
     """Error of each component with its 2-sigma bounds, as fig. 2b of Herath et al. (2007)."""
-    if record.error is None or record.covariance is None:
+    if record.errors.error is None or record.errors.covariance is None:
         return None
     components = errors_of(record)
-    left_out = len(record.axes) - len(components)
+    left_out = len(record.errors.axes) - len(components)
     more = f" {plural(left_out, 'further component')} not drawn." if left_out else ""
     if has_one_step(record):
         caption = (
@@ -198,8 +198,12 @@ def _errors(record: Record) -> Picture | None:
             f"About 95 % of honest errors are inside.{more}"
         )
         return Picture("Errors and stated bounds", caption, tuple(_errors_of_runs(record, c) for c in components))
-    clock, row = time_axis_of(record.t), shown_run(record)
-    meaning = "truth minus estimate" if record.window is None else f"of the motion over each window of {record.window}"
+    clock, row = time_axis_of(record.runs.t), shown_run(record)
+    meaning = (
+        "truth minus estimate"
+        if record.origin.window is None
+        else f"of the motion over each window of {record.origin.window}"
+    )
     caption = (
         f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
         f"states (dashed). Honest errors stay inside about 95 % of the time.{more}{clock.note}"
@@ -229,7 +233,7 @@ def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
             label = ""
         axes.axhline(0.0, **stroke(ZERO))
         draw_bounded(axes, clock.values, of.error[row], of.bound[row], f"run {record.run_numbers[row]}")
-        settled = slice(len(record.t) // 10, None)  # at the start errors and bounds may be larger by far
+        settled = slice(len(record.runs.t) // 10, None)  # at the start errors and bounds may be larger by far
         reach = 1.1 * max(_most(of.error[:, settled]), _most(of.bound[row, settled]))
         axes.set(ylabel=of.label, ylim=(-reach, reach) if reach > 0.0 else None)
         clock.name(axes)
@@ -239,23 +243,23 @@ def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
 
 def _errors_over_sigma(record: Record) -> Picture | None:
     """Error of each component over the standard deviation that is stated for it."""
-    if record.error is None or record.covariance is None or has_one_step(record):
+    if record.errors.error is None or record.errors.covariance is None or has_one_step(record):
         return None
-    clock, row = time_axis_of(record.t), shown_run(record)
+    clock, row = time_axis_of(record.runs.t), shown_run(record)
     caption = (
         f"Error over its stated standard deviation, of run {record.run_numbers[row]} and others. Shaded: 2 sigma, "
         f"inside which honest errors stay about 95 % of the time.{clock.note}"
     )
-    paints = tuple(_scaled_curves(record, clock, row, i) for i in range(min(len(record.axes), MOST_PANELS)))
+    paints = tuple(_scaled_curves(record, clock, row, i) for i in range(min(len(record.errors.axes), MOST_PANELS)))
     return Picture("Errors over their stated sigma", caption, paints)
 
 
 def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
-    assert record.error is not None
-    assert record.covariance is not None
-    sigma = np.sqrt(np.maximum(record.covariance[:, :, axis, axis], 0.0))
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    sigma = np.sqrt(np.maximum(record.errors.covariance[:, :, axis, axis], 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
-        scaled = record.error[..., axis] / sigma
+        scaled = record.errors.error[..., axis] / sigma
     others = np.linspace(0, len(scaled) - 1, MOST_RUNS + 1).astype(int)
 
     def paint(axes: Axes) -> None:
@@ -267,7 +271,7 @@ def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
         axes.axhline(0.0, **stroke(ZERO))
         curve(axes, clock.values, scaled[row], SHOWN, f"run {record.run_numbers[row]}")
         reach = max(LEAST_REACH, 1.1 * _most(scaled))
-        axes.set(ylabel=f"{record.names[axis]} / sigma", ylim=(-reach, reach))
+        axes.set(ylabel=f"{record.errors.names[axis]} / sigma", ylim=(-reach, reach))
         clock.name(axes)
 
     return paint
@@ -303,14 +307,14 @@ def _trajectory(record: Record) -> Picture | None:
 
 def _nees(record: Record, verdict: Verdict) -> Picture | None:
     """NEES of one run, or its average over runs, with the bands of a right estimator."""
-    if record.parts:  # of the whole no distribution is known
+    if record.errors.parts:  # of the whole no distribution is known
         return None
-    if record.independent or has_one_step(record):
+    if record.runs.independent or has_one_step(record):
         return _single_nees(record)
     scale, location = verdict.scale, verdict.location
-    if scale is None or len(scale.anees) != len(record.t):
+    if scale is None or len(scale.anees) != len(record.runs.t):
         return None
-    clock = time_axis_of(record.t)
+    clock = time_axis_of(record.runs.t)
     name = "NEES" if verdict.runs == 1 else f"NEES, average of {verdict.runs} runs"
     simultaneous = None
     if location is not None and np.isfinite(location.simultaneous).any():
@@ -338,19 +342,19 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
 
 def _worst_run(record: Record) -> Picture | None:
     """Mean NEES of each run, and the NEES over time of the run with the largest."""
-    nees = record.nees
-    if nees is None or record.parts or record.independent or has_one_step(record):
+    nees = record.errors.nees
+    if nees is None or record.errors.parts or record.runs.independent or has_one_step(record):
         return None
     there = np.isfinite(nees)
     if len(nees) < 2 or not there.any():
         return None
     counts = np.maximum(there.sum(axis=1), 1)
     means = np.where(there.any(axis=1), np.where(there, nees, 0.0).sum(axis=1) / counts, np.nan)
-    worst, clock = int(np.nanargmax(means)), time_axis_of(record.t)
+    worst, clock = int(np.nanargmax(means)), time_axis_of(record.runs.t)
     number = record.run_numbers[worst]
 
     def paint_runs(axes: Axes) -> None:
-        axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
+        axes.axhline(float(record.errors.dof), **stroke(EXPECTED), label="expected")
         points(axes, record.run_numbers.astype(float), means, EACH_RUN, "mean of a run")
         points(axes, np.array([float(number)]), means[[worst]], WORST, f"run {number}")
         axes.set_ylabel("mean NEES")
@@ -359,9 +363,9 @@ def _worst_run(record: Record) -> Picture | None:
             log_axis(axes, "y")
 
     def paint_worst(axes: Axes) -> None:
-        ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
+        ends = [float(distributions.chi2.ppf(q, record.errors.dof)) for q in (0.025, 0.975)]
         axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5)
-        axes.axhline(float(record.dof), **stroke(EXPECTED))
+        axes.axhline(float(record.errors.dof), **stroke(EXPECTED))
         curve(axes, clock.values, nees[worst], WORST, "")
         axes.set_ylabel(f"NEES of run {number}")
         clock.name(axes)
@@ -369,45 +373,45 @@ def _worst_run(record: Record) -> Picture | None:
             log_axis(axes, "y")
 
     caption = (
-        f"Mean NEES of each run, and the NEES of run {number}, which has the largest; {record.dof} is expected in the "
-        f"mean (lines). Shaded: where 95 % of the steps of a right estimator lie.{clock.note}"
+        f"Mean NEES of each run, and the NEES of run {number}, which has the largest; {record.errors.dof} is expected "
+        f"in the mean (lines). Shaded: where 95 % of the steps of a right estimator lie.{clock.note}"
     )
     return Picture("Which run, and when", caption, (paint_runs, paint_worst), height=1.6, is_shared=False)
 
 
 def _single_nees(record: Record) -> Picture | None:
     """NEES of each run of one step, or of each window, independent of the others."""
-    nees = record.nees
+    nees = record.errors.nees
     if nees is None or not np.isfinite(nees).any():
         return None
     what, each, note = "each run", "one run", ""
-    if record.independent:
-        note = time_axis_of(record.t).note
-        what, each = f"the motion over each window of {record.window or 'a step'}", "one window"
+    if record.runs.independent:
+        note = time_axis_of(record.runs.t).note
+        what, each = f"the motion over each window of {record.origin.window or 'a step'}", "one window"
 
     def paint(axes: Axes) -> None:
         x, rows = record.run_numbers.astype(float), nees[:, :1].T
-        if record.independent:
-            x, rows = time_axis_of(record.t).values, nees
-        ends = [float(distributions.chi2.ppf(q, record.dof)) for q in (0.025, 0.975)]
+        if record.runs.independent:
+            x, rows = time_axis_of(record.runs.t).values, nees
+        ends = [float(distributions.chi2.ppf(q, record.errors.dof)) for q in (0.025, 0.975)]
         axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5, label=f"95 % band of {each}")
-        axes.axhline(float(record.dof), **stroke(EXPECTED), label="expected")
+        axes.axhline(float(record.errors.dof), **stroke(EXPECTED), label="expected")
         label = f"NEES of {each.replace('one', 'a')}"
         for values in rows:
             points(axes, x, values, EACH_RUN, label)
             label = ""
         axes.set_ylabel("NEES")
-        if record.independent:
-            time_axis_of(record.t).name(axes)
+        if record.runs.independent:
+            time_axis_of(record.runs.t).name(axes)
         else:
             _span_runs(axes, record)
         if wide([nees]):
             log_axis(axes, "y")
 
-    plural_of = "windows" if record.independent else "runs"
+    plural_of = "windows" if record.runs.independent else "runs"
     caption = (
-        f"NEES of {what}; {record.dof} is expected in the mean (line). Above is overconfident, below conservative. "
-        f"Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"
+        f"NEES of {what}; {record.errors.dof} is expected in the mean (line). Above is overconfident, below "
+        f"conservative. Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"
     )
     return Picture("NEES", caption, (paint,), height=1.9)
 
@@ -421,14 +425,14 @@ def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
     Of all steps of all runs; -> (N,) each.
     """
     found: dict[str, Array] = {}
-    if record.error is not None and record.covariance is not None:
-        sigma = np.sqrt(np.diagonal(record.covariance, axis1=-2, axis2=-1))
+    if record.errors.error is not None and record.errors.covariance is not None:
+        sigma = np.sqrt(np.diagonal(record.errors.covariance, axis1=-2, axis2=-1))
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.abs(record.error) / sigma
-        for i, name in enumerate(record.names[:MOST_PANELS]):
+            z = np.abs(record.errors.error) / sigma
+        for i, name in enumerate(record.errors.names[:MOST_PANELS]):
             found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
-    if record.nees is not None and record.dof and not record.parts:
-        found["all together"] = _shares(record.nees, distributions.chi2.ppf(p, record.dof))
+    if record.errors.nees is not None and record.errors.dof and not record.errors.parts:
+        found["all together"] = _shares(record.errors.nees, distributions.chi2.ppf(p, record.errors.dof))
     return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
 
 
@@ -465,13 +469,13 @@ def _coverage(record: Record) -> Picture | None:
 
 def _innovations(record: Record, verdict: Verdict) -> Picture | None:
     """NIS over its degrees of freedom, averaged over runs."""
-    if record.nis is None or record.nis_dof is None:
+    if record.innovations.nis is None or record.innovations.nis_dof is None:
         return None
-    clock = time_axis_of(record.t)
-    known = np.isfinite(record.nis) & (record.nis_dof > 0)
-    dof = np.where(known, record.nis_dof, 0.0).sum(axis=0)
+    clock = time_axis_of(record.runs.t)
+    known = np.isfinite(record.innovations.nis) & (record.innovations.nis_dof > 0)
+    dof = np.where(known, record.innovations.nis_dof, 0.0).sum(axis=0)
     least = np.maximum(dof, 1.0)
-    ratio = np.where(dof > 0, np.where(known, record.nis, 0.0).sum(axis=0) / least, np.nan)
+    ratio = np.where(dof > 0, np.where(known, record.innovations.nis, 0.0).sum(axis=0) / least, np.nan)
     ends = np.column_stack([distributions.chi2.ppf(q, least) / least for q in (0.025, 0.975)])
 
     def paint(axes: Axes) -> None:
@@ -493,8 +497,8 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
 
 def shown_run(record: Record) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
-    assert record.error is not None
-    return int(np.argmax(np.isfinite(record.error).all(axis=-1).sum(axis=1)))
+    assert record.errors.error is not None
+    return int(np.argmax(np.isfinite(record.errors.error).all(axis=-1).sum(axis=1)))
 
 
 def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | None:
@@ -502,15 +506,15 @@ def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | Non
 
     It shows the two axes over which the path reaches furthest.
     """
-    if record.path is None or record.error is None or record.window is not None:
+    if record.origin.path is None or record.errors.error is None or record.origin.window is not None:
         return None
     row = shown_run(record)
-    true, estimated = record.path[row, :, 0], record.path[row, :, 1]
-    known = np.isfinite(record.path[row]).all(axis=(1, 2))
-    if known.sum() < 2 or sum(axis in record.axes for axis in NAMES) < 2:
+    true, estimated = record.origin.path[row, :, 0], record.origin.path[row, :, 1]
+    known = np.isfinite(record.origin.path[row]).all(axis=(1, 2))
+    if known.sum() < 2 or sum(axis in record.errors.axes for axis in NAMES) < 2:
         return None
     pair = furthest(record, np.ptp(true[known], axis=0))
-    steps = _worst(record, row) if record.convention in IN_WORLD else np.empty(0, np.int64)
+    steps = _worst(record, row) if record.errors.convention in IN_WORLD else np.empty(0, np.int64)
 
     def paint(axes: Axes) -> None:
         path(axes, true[:, pair], TRUE, "truth")
@@ -521,25 +525,25 @@ def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | Non
             label = ""
         if len(steps):
             axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
-        x, y = (record.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
+        x, y = (record.errors.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
         axes.set(xlabel=f"{x} (m)", ylabel=f"{y} (m)")
         make_map(axes)
 
-    caption = f"Trajectory of {record.unit} {record.run_numbers[row]}, true and estimated."
+    caption = f"Trajectory of {record.runs.unit} {record.run_numbers[row]}, true and estimated."
     if len(steps):
         where = ", ".join(str(step + 1) for step in sorted(steps))
         caption += (
             " Ellipses: where the truth lies with 95 % by the stated covariance, in the steps whose errors are "
             f"largest against it ({where}); crosses are the truth there."
         )
-    elif record.convention not in IN_WORLD:
+    elif record.errors.convention not in IN_WORLD:
         caption += " No ellipses: the stated covariance is not about the axes of the world."
     return caption, paint
 
 
 def furthest(record: Record, reach: Array) -> list[int]:
     """Two of the position's axes that are judged, with the largest product of their reach (3,); else the first."""
-    judged = [i for i, name in enumerate(NAMES) if name in record.axes]
+    judged = [i for i, name in enumerate(NAMES) if name in record.errors.axes]
     return list(max(itertools.combinations(judged, 2), key=lambda two: float(np.prod(reach[list(two)]))))
 
 
@@ -547,11 +551,11 @@ def ellipses_at(record: Record, row: int, steps: Indices, pair: Sequence[int]) -
     """Outlines (corners, 2) of the 95 % regions of one run in some steps, about the estimates."""
     if not len(steps):
         return []
-    assert record.path is not None
-    assert record.covariance is not None
-    index = [list(record.axes).index(NAMES[axis]) for axis in pair]
-    P = np.asarray(record.covariance[row], float)[steps][:, index][:, :, index]
-    centres = record.path[row, steps, 1][:, list(pair)]
+    assert record.origin.path is not None
+    assert record.errors.covariance is not None
+    index = [list(record.errors.axes).index(NAMES[axis]) for axis in pair]
+    P = np.asarray(record.errors.covariance[row], float)[steps][:, index][:, :, index]
+    centres = record.origin.path[row, steps, 1][:, list(pair)]
     return [ellipse(centre, own) for centre, own in zip(centres, P, strict=True)]
 
 
@@ -564,9 +568,9 @@ def ellipse(centre: Array, P: Array) -> Array:
 
 def _worst(record: Record, row: int) -> Indices:
     """Steps of the largest NEES, at most five, and apart from each other by a twentieth of the run."""
-    if record.nees is None:
+    if record.errors.nees is None:
         return np.empty(0, np.int64)
-    nees = np.where(np.isfinite(record.nees[row]), record.nees[row], -1.0)
+    nees = np.where(np.isfinite(record.errors.nees[row]), record.errors.nees[row], -1.0)
     apart, found = max(len(nees) // 20, 1), list[int]()
     for step in np.argsort(-nees, kind="stable"):
         if nees[step] < 0.0 or len(found) == MOST:

@@ -246,7 +246,7 @@ def compose_files(
         *verdicts.judgement(study), *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
-    notes = list(dict.fromkeys(note for name in judged for note in named[name].notes))
+    notes = list(dict.fromkeys(note for name in judged for note in named[name].origin.notes))
     read = tuple(Text(_begun(note)) for note in notes)
     chapters += [
         Chapter("verdicts", "Verdict in figures", "Figures", blocks),
@@ -278,10 +278,10 @@ def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
 
 
 def _counts(record: Record, verdict: Verdict) -> str:
-    clock = time_axis_of(record.t)
-    length = plural(verdict.steps, "step" if record.window is None else "window")
-    size = f"{plural(verdict.runs, verdict.unit)} of {record.window if record.independent else length}"
-    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.t) > 1 else size
+    clock = time_axis_of(record.runs.t)
+    length = plural(verdict.steps, "step" if record.origin.window is None else "window")
+    size = f"{plural(verdict.runs, verdict.unit)} of {record.origin.window if record.runs.independent else length}"
+    return f"{size}, {np.ptp(clock.values):.4g} s" if clock.word == "s" and len(record.runs.t) > 1 else size
 
 
 def facts(manifest: dict[str, Any]) -> tuple[tuple[str, str], ...]:

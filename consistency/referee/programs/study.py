@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,8 @@ from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
     ProgramRun,
+    ProgramRuns,
     ProgramStudy,
-    Runs,
     filled,
     is_recorded,
     kind_of_failure,
@@ -356,7 +356,7 @@ class _Loop:
     def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading, fields: dict[str, Any]) -> None:
         self.program, self.plan, self.study, self.options = program, plan, study, r
         self.fields = fields  # of the manifest
-        self.runs = Runs(study, r, found_in)
+        self.runs = ProgramRuns(study, r, found_in)
         self.logs: dict[int, ProgramRun] = {}
         self.total = len(plan.inputs) or plan.runs
         self.design: Design | None = None
@@ -499,7 +499,9 @@ class _Loop:
     def _records(self, runs: int | None) -> list[Record]:
         records = records_of_found(self.runs.estimators(runs), self.options)
         records = [record.without_first(self.plan.skip) for record in records]
-        return [replace(record, optimal_gain=self.plan.optimal_gain) for record in records]
+        if self.plan.optimal_gain:
+            records = [record.with_optimal_gain() for record in records]
+        return records
 
     def judged(self) -> tuple[list[Record], dict[str, Verdict]]:
         """Records and verdicts of all runs; those of a study until decided up to the first missing run."""
@@ -539,7 +541,7 @@ class _Loop:
             self._take(self._done(0, new_folder(self.study.folder, 0)), stack)
         folder = self.study.folder / "run 0 again"
         shutil.rmtree(folder, ignore_errors=True)
-        again = Runs(self.study, self.options, found_in)
+        again = ProgramRuns(self.study, self.options, found_in)
         again.take(self._done(0, folder))
         shutil.rmtree(folder, ignore_errors=True)
         if 0 not in self.runs.found or 0 not in again.found:
@@ -553,7 +555,12 @@ class _Loop:
 def _require_looks(records: Sequence[Record]) -> None:
     """Refuse records whose verdict has no form for looks at growing numbers of runs."""
     for record in records:
-        if record.parts or record.independent or record.unshown or record.truth_covariance is not None:
+        if (
+            record.errors.parts
+            or record.runs.independent
+            or record.origin.unshown
+            or record.truth.covariance is not None
+        ):
             what = "components, windows or a truth that are judged by themselves"
             raise InputError(f"--until-decided: {record.name} has {what}; give --runs")
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.questions.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
+from consistency.referee.diagnostics.records.record import TruthFit
 from consistency.referee.diagnostics.records.whitening import by_runs, whiten
 from consistency.referee.diagnostics.verdict.parts import BIAS, GROUP, INNOVATIONS, MAIN, SHARES, STEP
 from consistency.referee.errors import InputError
@@ -59,17 +59,8 @@ class Aligned:
     """Runs in the world of the truth, with notes on the alignment."""
 
     runs: Sequence[Poses]  # moved estimates, with covariances of the residual errors
-    align: str = "none"  # the mode
+    fit: TruthFit  # what the frames leave of the errors
     notes: tuple[str, ...] = ()
-    caption: str = ""  # what the verdict has to say of it
-    reduced: bool = False  # the errors may be smaller than the covariance says without a fault
-    unavailable: tuple[str, ...] = ()  # questions that have no answer
-    unseen: float = 0.0  # share of the NEES that a frame may have absorbed without a correction
-
-    @property
-    def of_record(self) -> dict[str, Any]:
-        """What a record has of it."""
-        return {name: value for name, value in vars(self).items() if name not in ("runs", "notes")}
 
 
 def frames_of(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) -> list[WorldTransform]:
@@ -158,7 +149,7 @@ def aligned(
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
     sizes = _sizes_in_words(name, mode, frames)
-    return replace(found, align=mode, notes=(sizes, *found.notes))
+    return replace(found, fit=replace(found.fit, align=mode), notes=(sizes, *found.notes))
 
 
 # --- residual errors -------------------------------------------------------------------------------------------
@@ -185,7 +176,7 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         bases = [orthonormal([A])[0] for A in tangents]
     dof = max(Q.shape[-1] for Q in bases)
     what = f"aligned by {mode}, a frame of {dof} degrees of freedom for {of}"
-    of_runs = Aligned(runs, caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE)
+    of_runs = Aligned(runs, TruthFit(caption=f"{what}: {OF_RUNS}", reduced=True, unavailable=ALL_BUT_SCALE))
     if len(some) < ENOUGH:
         note = f"fewer than {ENOUGH} runs do not show what the frame takes of the errors; nothing makes up for it"
         return replace(of_runs, notes=(f"{name}: {note}",))
@@ -193,8 +184,9 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     if left.oscillating:
         most = f"at most about {100.0 * left.unseen:.2g} % of the NEES"
         note = f"the errors alternate or oscillate; nothing makes up for what the frame takes of them, {most}"
-        caption = f"{of_runs.caption}, and {OSCILLATING} ({most})"
-        return replace(of_runs, notes=(f"{name}: {note}",), caption=caption, unseen=left.unseen)
+        caption = f"{of_runs.fit.caption}, and {OSCILLATING} ({most})"
+        fit = replace(of_runs.fit, caption=caption, unseen=left.unseen)
+        return replace(of_runs, fit=fit, notes=(f"{name}: {note}",))
     kept = np.empty(len(some))
     largest = 0.0
     for k, M in enumerate(left.covariances):
@@ -209,12 +201,12 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
     notes = (f"{name}: the frame takes {taken:.2g} % of the NEES of a right covariance, made up for",)
     if not for_all:
         return replace(of_runs, runs=out, notes=notes)
-    of_all = Aligned(out, notes=notes, caption=f"{what}: {OF_ALL}")
+    fit = TruthFit(caption=f"{what}: {OF_ALL}")
     if len(some) * (largest - 1.0) > COMMON:
-        return replace(of_all, caption=f"{of_all.caption}, nor are single steps", unavailable=(STEP, GROUP, *BIAS))
-    if inflation_of_mean(residuals, bases) > 1.0 + COMMON:
-        return replace(of_all, caption=f"{of_all.caption}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
-    return of_all
+        fit = TruthFit(caption=f"{fit.caption}, nor are single steps", unavailable=(STEP, GROUP, *BIAS))
+    elif inflation_of_mean(residuals, bases) > 1.0 + COMMON:
+        fit = TruthFit(caption=f"{fit.caption}, nor is a bias: {NO_MEAN}", unavailable=BIAS)
+    return Aligned(out, fit, notes)
 
 
 def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Aligned:
@@ -229,13 +221,15 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
     if len(every):
         larger = float(np.median(every))
     if larger < 1.0 + SLIGHT:
-        return Aligned(out, caption="aligned by origin: the error of the first pose of each run is not judged")
+        return Aligned(
+            out, TruthFit(caption="aligned by origin: the error of the first pose of each run is not judged")
+        )
     note = (
         f"{name}: the first pose is not exact, and files do not say how its error is correlated with the others; "
         f"covariances are made {larger:.3g} times as large in the median, which holds whatever that is"
     )
     caption = "aligned by origin, whose first poses are not exact: a covariance that is too large is not judged"
-    return Aligned(out, notes=(note,), caption=caption, reduced=True, unavailable=(*BIAS, "outliers"))
+    return Aligned(out, TruthFit(caption=caption, reduced=True, unavailable=(*BIAS, "outliers")), (note,))
 
 
 # --- words --------------------------------------------------------------------------------------------------

@@ -16,7 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import INDEFINITE, Record, arrays_of
+from consistency.referee.diagnostics.records.record import (
+    INDEFINITE,
+    Errors,
+    InnovationRecord,
+    Origin,
+    Record,
+    Runs,
+    Truth,
+)
 from consistency.referee.diagnostics.records.whitening import (
     DEFICIENT,
     ROUNDED,
@@ -142,21 +150,20 @@ def assemble(
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
     dof = len(axes) if arrays["error"] is not None else 0
+    numbers = np.array([track.run for track in tracks], dtype=np.int64)
     return Record(
         name,
-        runs=np.array([track.run for track in tracks], dtype=np.int64),
-        t=t,
-        dof=dof,
-        axes=axes,
-        failures=tuple(failures),
-        convention=convention,
-        notes=tuple(notes),
-        **arrays,
+        Errors(arrays["error"], arrays["covariance"], arrays["nees"], dof, axes, convention=convention),
+        InnovationRecord(arrays["nis"], arrays["nis_dof"]),
+        Runs(numbers, t=t, times=arrays["t"], by=arrays["by"]),
+        tuple(failures),
+        Truth(arrays["truth_covariance"]),
+        origin=Origin(notes=tuple(notes), path=arrays["path"]),
     )
 
 
 def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
-    """Arrays over (runs, steps), as a record has them, NaN where a run has no row."""
+    """Arrays of tracks over (runs, steps), NaN where a run has no row."""
     arrays: dict[str, Any] = {}
     for key in (*ARRAYS, "nees", "t"):
         arrays[key] = None
@@ -168,7 +175,6 @@ def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
                 shape = (len(tracks), steps, *values.shape[1:])
                 arrays[key] = np.full(shape, np.nan)
             arrays[key][row, track.column] = values
-    arrays["times"] = arrays.pop("t")
     return arrays
 
 
@@ -178,15 +184,19 @@ def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
         return record
     numbers = np.append(record.run_numbers, list(failed))
     order = np.argsort(numbers)
-    arrays: dict[str, Any] = {}
-    for name, array in arrays_of(record).items():
+
+    def with_rows(array: Array) -> Array:
         nothing = np.full((len(failed), *array.shape[1:]), np.nan)
-        arrays[name] = np.concatenate([array, nothing])[order]
+        return np.concatenate([array, nothing])[order]
+
+    numbered = replace(record, runs=replace(record.runs, numbers=None), groups=None)
+    longer = numbered.changed(with_rows)
     failures = list(record.failures)
     for run, reason in failed.items():
         failures.append(Failure(record.name, run, 1, reason))
     failures.sort(key=lambda failure: failure.run)
-    return replace(record, **arrays, runs=numbers[order], failures=tuple(failures))
+    runs = replace(longer.runs, numbers=numbers[order])
+    return replace(longer, runs=runs, groups=record.groups, failures=tuple(failures))
 
 
 def _require_different(file: str, tracks: Sequence[Track]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.diagnostics.questions.uncertain_truth import DECLARED
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Record, Truth
 from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
@@ -48,7 +48,7 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
     asked = r.given(["truth_errors", "truth_shared"])
     found = []
     for record in records:
-        P = record.truth_covariance
+        P = record.truth.covariance
         if P is None:
             if asked:
                 raise InputError(
@@ -57,7 +57,7 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
                 )
             found.append(record)
             continue
-        if record.parts:
+        if record.errors.parts:
             raise InputError(f"{record.name}: --truth-covariance needs covariances; here deviations alone are stated")
         kind = classify(P, ROUNDED)
         wrong = np.argwhere((kind == Validity.INDEFINITE) | (kind == Validity.ASYMMETRIC))
@@ -67,15 +67,15 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
                 f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is not "
                 "a covariance: it is not symmetric, or negative in some direction"
             )
-        record = replace(record, truth_errors=r.truth_errors, truth_shared=bool(r.truth_shared))
+        record = replace(record, truth=Truth(P, r.truth_errors, bool(r.truth_shared)))
         missing = 0
-        if record.nees is not None:
+        if record.errors.nees is not None:
             unknown = np.isnan(P).any(axis=(2, 3))
-            missing = int((unknown & np.isfinite(record.nees)).sum())
+            missing = int((unknown & np.isfinite(record.errors.nees)).sum())
         if missing and not np.isfinite(P).any():
             raise InputError(f"{record.name}: the truth has a covariance in none of the steps that are judged")
         if missing:
             note = f"{record.name}: {plural(missing, 'estimate')} whose truth has no covariance are left out"
-            record = replace(record, notes=(*record.notes, note))
+            record = record.with_notes(note)
         found.append(record)
     return found

@@ -241,16 +241,17 @@ def baseline(
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
     for each in source.filters:
         record = source.record(each).without_first(first)
-        if record.nees is None:
+        if record.errors.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
-        of_runs |= record.trials
+        of_runs |= record.runs.trials
         failures[each] = len(record.failures)
-        axes[each] = tuple(record.axes)
+        axes[each] = tuple(record.errors.axes)
         own = record
-        if not record.unshown:
+        if not record.origin.unshown:
             own = record.as_runs
-        world = own.in_world
-        filters[each] = summary(cast(Array, own.nees), own.dof, world.error, world.covariance, own.run_numbers)
+        world = own.in_world.errors
+        nees = cast(Array, own.errors.nees)
+        filters[each] = summary(nees, own.errors.dof, world.error, world.covariance, own.run_numbers)
     trials = source.trials
     if truth is not None:
         trials = (_digest(truth), None)

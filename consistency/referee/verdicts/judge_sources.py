@@ -89,10 +89,10 @@ def judge_all(
     verdicts = {}
     for name in filters or source.filters:
         record = source.record(name)
-        if first is not None and record.skipped is None:
+        if first is not None and record.runs.skipped is None:
             record = record.without_first(first)
         if optimal_gain or source.optimal_gain:
-            record = replace(record, optimal_gain=True)
+            record = record.with_optimal_gain()
         verdicts[name] = judge(record, settings, design)
     return verdicts
 
@@ -226,12 +226,12 @@ def pilots_of_records(
         if name not in named:
             raise InputError(f"--filter {name}: is not in these runs; there are: {', '.join(named)}")
         record = named[name]
-        if record.nees is None or record.parts:
+        if record.errors.nees is None or record.errors.parts:
             raise InputError(f"{name}: a pilot needs truth and a whole covariance")
-        means, counts = run_means(record.nees)
+        means, counts = run_means(record.errors.nees)
         failed = np.isin(record.run_numbers, [failure.run for failure in record.failures])
-        means = means[(counts > 0) & ~failed] / record.dof
+        means = means[(counts > 0) & ~failed] / record.errors.dof
         if len(means) < FEW:
             raise InputError(f"{name}: a pilot needs at least {FEW} runs that did not fail, got {len(means)}")
-        pilots[name] = means, record.nees.shape[1]
-    return pilots, next(iter(named.values())).dof
+        pilots[name] = means, record.errors.nees.shape[1]
+    return pilots, next(iter(named.values())).errors.dof

@@ -60,28 +60,28 @@ def exported(results, tmp_path_factory):
 def test_both_ways_in_give_the_same_nees_and_verdict(results, exported):
     c = record_of(results, "right")
     [recording] = read_recordings(*exported, error="right")
-    assert_allclose(recording.nees, c.nees, rtol=1e-9)
-    assert_allclose(recording.error[:, 1:], c.error[:, 1:], rtol=0, atol=1e-12)
+    assert_allclose(recording.errors.nees, c.errors.nees, rtol=1e-9)
+    assert_allclose(recording.errors.error[:, 1:], c.errors.error[:, 1:], rtol=0, atol=1e-12)
     ours, theirs = cs.analyse(results)["right"], analyse([recording])["right"]
     assert (ours.status, ours.convention) == (theirs.status, theirs.convention)
     assert ours.statistic == pytest.approx(theirs.statistic, rel=1e-9)
     assert ours.inflation_interval == pytest.approx(theirs.inflation_interval, rel=1e-9)
     [wrong] = read_recordings(*exported, error="so2")
-    assert np.nanmax(np.abs(wrong.nees - c.nees)) > 1.0, "negative control"
+    assert np.nanmax(np.abs(wrong.errors.nees - c.errors.nees)) > 1.0, "negative control"
 
 
 def test_both_ways_of_the_invariant_filter_of_the_bench(uvd, tmp_path):
     results = cs.run_trials(uvd, ["ri-ekf-uvd"], runs=RUNS, seed=5, jobs=1)
     c = record_of(results, "ri-ekf-uvd")
     [recording] = read_recordings(*export(results, "ri-ekf-uvd", tmp_path), error="right")
-    assert_allclose(recording.nees, c.nees, rtol=1e-9)
+    assert_allclose(recording.errors.nees, c.errors.nees, rtol=1e-9)
     ours, theirs = cs.analyse(results)["ri-ekf-uvd"], analyse([recording])["ri-ekf-uvd"]
     assert (ours.status, ours.convention) == (theirs.status, "right")
     trial = cs.simulate(uvd, 3, seed=5)
     compiled = run_filter(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
     stepped = step_through(cs.get_filter("ri-ekf-uvd"), trial, uvd.belief)
     assert_allclose(stepped.own, compiled.own, rtol=1e-7, atol=1e-12)
-    assert_array_equal(c.covariance[3, 1:], compiled.own[1:])
+    assert_array_equal(c.errors.covariance[3, 1:], compiled.own[1:])
 
 
 def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder):
@@ -89,9 +89,9 @@ def test_columns_of_own_errors_serve_only_the_filter_that_has_them(folder):
         r.name: r for r in read_recordings(folder / "estimates.parquet", folder / "truth.parquet", error="right")
     }
     c = record_of(open_results(folder), "ekf-uvd")
-    assert_array_equal(by_name["ekf-uvd"].covariance[:, 1:], c.covariance[:, 1:])
-    assert not any("own_P" in note for note in by_name["ekf-uvd"].notes)
-    assert any("own_P" in note for note in by_name["right"].notes)
+    assert_array_equal(by_name["ekf-uvd"].errors.covariance[:, 1:], c.errors.covariance[:, 1:])
+    assert not any("own_P" in note for note in by_name["ekf-uvd"].origin.notes)
+    assert any("own_P" in note for note in by_name["right"].origin.notes)
 
 
 # --- what is judged ---------------------------------------------------------------------------------
@@ -101,15 +101,15 @@ def test_a_record_holds_both_errors(results, folder):
     for source in (results, open_results(folder)):
         c = record_of(source, "right")
         rows = results.estimates.query("filter == 'right' and run == 3")
-        assert_array_equal(c.nees[3], rows["own_nees"])
-        assert_array_equal(c.covariance[3, :, 0, 2], rows["own_P_xh"])
-        assert_array_equal(c.covariance[3, :, 2, 0], rows["own_P_xh"])
-        assert_array_equal(c.in_world.nees[3], rows["nees"])
-        assert_array_equal(c.in_world.nis[3], rows["nis"])
-        assert_array_equal(c.in_world.covariance[3, :, 0, 2], rows["P_xh"])
-        assert (c.convention, c.in_world.convention) == ("right", "")
+        assert_array_equal(c.errors.nees[3], rows["own_nees"])
+        assert_array_equal(c.errors.covariance[3, :, 0, 2], rows["own_P_xh"])
+        assert_array_equal(c.errors.covariance[3, :, 2, 0], rows["own_P_xh"])
+        assert_array_equal(c.in_world.errors.nees[3], rows["nees"])
+        assert_array_equal(c.in_world.innovations.nis[3], rows["nis"])
+        assert_array_equal(c.in_world.errors.covariance[3, :, 0, 2], rows["P_xh"])
+        assert (c.errors.convention, c.in_world.errors.convention) == ("right", "")
         plain = record_of(source, "ekf-uvd")
-        assert (plain.world, plain.in_world, plain.convention) == (None, plain, "")
+        assert (plain.world, plain.in_world, plain.errors.convention) == (None, plain, "")
 
 
 def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results):
@@ -133,11 +133,11 @@ def test_the_headline_is_of_the_own_error_and_the_world_beside_it(results):
 
 def test_run_means_and_baselines_are_of_the_own_error(results):
     c = record_of(results, "right")
-    assert_allclose(mean_nees_of_runs(c), np.nanmean(c.nees, axis=1), rtol=1e-12)
+    assert_allclose(mean_nees_of_runs(c), np.nanmean(c.errors.nees, axis=1), rtol=1e-12)
     of = baseline(results_source(results)).filters["right"]
     assert_allclose(of.nees, mean_nees_of_runs(c) / 3.0, rtol=1e-12)
-    world, counted = c.in_world, np.isfinite(c.nees)[..., None]
-    square = np.nanmean(np.where(counted, np.square(world.error), np.nan), axis=1)
+    world, counted = c.in_world, np.isfinite(c.errors.nees)[..., None]
+    square = np.nanmean(np.where(counted, np.square(world.errors.error), np.nan), axis=1)
     assert_allclose(of.squared, square, rtol=1e-12)
 
 
@@ -160,7 +160,7 @@ def test_until_decided_says_both(uvd):
     v = verdicts["right"]
     c = record_of(results, "right")
     assert (v.convention, v.runs) == ("right", len(c.run_numbers))
-    assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.in_world.nees[: v.world.runs]))
+    assert v.world.scale.mean_anees == pytest.approx(np.nanmean(c.in_world.errors.nees[: v.world.runs]))
     assert v.map.runs == v.runs
     again = analyse(results)["right"]
     assert (again.status, again.statistic, again.world.statistic) == (v.status, v.statistic, v.world.statistic)
@@ -266,11 +266,11 @@ def test_some_runs_have_both_errors_and_their_own_failures(results):
     failures = (Failure("right", 3, 2, "NaN"), Failure("right", 11, 2, "NaN"))
     c = replace(record_of(results, "right"), failures=failures)
     some = c.first_runs(10)
-    assert_array_equal(some.nees, c.nees[:10])
-    assert_array_equal(some.in_world.nees, c.in_world.nees[:10])
-    assert_array_equal(some.covariance, c.covariance[:10])
-    assert_array_equal(some.in_world.error, c.in_world.error[:10])
+    assert_array_equal(some.errors.nees, c.errors.nees[:10])
+    assert_array_equal(some.in_world.errors.nees, c.in_world.errors.nees[:10])
+    assert_array_equal(some.errors.covariance, c.errors.covariance[:10])
+    assert_array_equal(some.in_world.errors.error, c.in_world.errors.error[:10])
     assert_array_equal(some.run_numbers, np.arange(10))
     assert some.failures == failures[:1]
     one = c.of_runs(np.flatnonzero(c.run_numbers == 11))
-    assert (one.nis.shape[0], one.failures) == (1, failures[1:])
+    assert (one.innovations.nis.shape[0], one.failures) == (1, failures[1:])

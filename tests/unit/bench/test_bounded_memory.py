@@ -4,18 +4,18 @@ import os
 import subprocess
 import sys
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from records import changed
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import analyse, record_of
 from consistency.bench.store.results import open_results
-from consistency.diagnostics import Record, Settings, judge, summary
+from consistency.diagnostics import Settings, judge, make_record, summary
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
 from consistency.referee.document.tables import document
@@ -31,7 +31,7 @@ def evidence(runs, steps=STEPS, bias=0.3):
     P = np.tile(0.2 + np.diag([0.8, 1.8, 2.8]), (runs, steps, 1, 1))
     error = rng.standard_normal((runs, steps, 3)) + bias
     nis = rng.chisquare(2, (runs, steps))
-    return Record("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
+    return make_record("f", error, P, nis=nis, nis_dof=np.full((runs, steps), 2), axes=("x", "y", "heading"))
 
 
 def numbers_a_cell(work, runs=1400):
@@ -55,15 +55,20 @@ def test_a_verdict_takes_six_numbers_for_each_step_of_a_run(settings):
 
 def test_a_summary_of_runs_takes_hardly_any():
     nees = np.random.default_rng(0).chisquare(3, (4200, STEPS))
-    assert numbers_a_cell(lambda g: summary(nees[: len(np.asarray(g.nis))], 3, g.error, g.covariance)) < 0.5
+    assert (
+        numbers_a_cell(
+            lambda g: summary(nees[: len(np.asarray(g.innovations.nis))], 3, g.errors.error, g.errors.covariance)
+        )
+        < 0.5
+    )
 
 
 def test_errors_about_their_mean():
     """With variances 1, 2, 3 alone the NEES about the mean has a closed form."""
     given = evidence(30, 8)
     P = np.tile(np.diag([1.0, 2.0, 3.0]), (30, 8, 1, 1))
-    sample = sample_of(replace(given, covariance=P), Settings())
-    about = (given.error - given.error.mean(axis=0)) * np.sqrt(30 / 29)
+    sample = sample_of(changed(given, covariance=P), Settings())
+    about = (given.errors.error - given.errors.error.mean(axis=0)) * np.sqrt(30 / 29)
     nees = (np.square(about) / [1.0, 2.0, 3.0]).sum(axis=-1)
     assert_allclose(sample.centred_means(slice(2, None)), nees[:, 2:].mean(axis=1) / 3)
     centred = sample.centred()

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from records import changed
 from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_outcome import outcome_of
-from consistency.diagnostics import JointNees, Record, Settings, judge
+from consistency.diagnostics import JointNees, Settings, judge, make_record
 from consistency.referee.diagnostics.questions.maps import joint_nees, joint_test, last_nees
 from consistency.referee.diagnostics.questions.scale import is_tolerated
 from consistency.referee.diagnostics.verdict.parts import JOINT, JOINT_DISTRIBUTION
@@ -34,10 +35,11 @@ def map_of_gaussians(rng, errors, P):
     error = errors[:, 3:].reshape(len(errors), -1, 3)
     blocks = np.stack([P[i : i + 3, i : i + 3] for i in range(3, NUMBER, 3)])
     joint = JointNees(parts[:, 0], parts[:, 1:].sum(axis=1), np.full(len(errors), NUMBER - 3), parts[:, 1:])
-    return Record(
-        "map", error, np.broadcast_to(blocks, (*error.shape, 3)).copy(), axes=("x", "y", "z"),
-        landmarks=np.arange(10, 10 + LANDMARKS), joint=joint,
-    )  # fmt: skip
+    return changed(
+        make_record("map", error, np.broadcast_to(blocks, (*error.shape, 3)).copy(), axes=("x", "y", "z")),
+        landmarks=np.arange(10, 10 + LANDMARKS),
+        joint=joint,
+    )
 
 
 def verdict_on(rng, spoil="", false_alarm=0.05, runs=RUNS):
@@ -133,7 +135,7 @@ def test_a_joint_scale_within_the_tolerance_is_excused(ratio):
         assert test.p_values[JOINT] < 1e-10
         assert is_tolerated(test.nees, test.score.dof, settings) == excused
         nees = np.random.default_rng(8).chisquare(3, (50, 1))
-        v = judge(Record("map", nees=nees, dof=3, joint=joint, landmarks=np.arange(1)), settings)
+        v = judge(changed(make_record("map", nees=nees, dof=3), joint=joint, landmarks=np.arange(1)), settings)
         assert [(a.found, a.tolerated) for a in v.answers if a.question == JOINT] == [(True, excused)]
 
 
@@ -147,9 +149,9 @@ def test_runs_without_a_definite_joint_covariance_are_named():
     rng = np.random.default_rng(7)
     P = covariance_of(rng)
     evidence = map_of_gaussians(rng, rng.standard_normal((RUNS, NUMBER)) @ np.linalg.cholesky(P).T, P)
-    broken = np.where(np.arange(RUNS) == 4, np.inf, evidence.joint.map)
+    broken = np.where(np.arange(RUNS) == 4, np.inf, evidence.map.joint.map)
     numbers = np.arange(100, 100 + RUNS)
-    v = judge(replace(evidence, joint=replace(evidence.joint, map=broken), runs=numbers), Settings(1e-6))
+    v = judge(changed(evidence, joint=replace(evidence.map.joint, map=broken), runs=numbers), Settings(1e-6))
     assert v.status == "failed"
     assert v.joint.not_definite == (104,)
     assert "not positive definite in 1 of 30 runs, first run 104" in v.reasons[0]
@@ -199,7 +201,7 @@ def results():
 
 def _evidence(results, name):
     record = record_of(results, name)
-    evidence = record.map().record(last_nees(record))
+    evidence = record.map.read().record(last_nees(record))
     assert evidence is not None
     return evidence
 
@@ -217,12 +219,12 @@ def test_the_table_has_the_nees_of_the_joint_error(results, name):
     at = results.estimates[(results.estimates["filter"] == name) & (results.estimates["run"] == 2)].iloc[-1]
     pose = at["nees"] if name == "ekf-uvd" else at["own_nees"]
     assert rows["joint_nees"].sum() + pose == pytest.approx(error @ np.linalg.solve(own, error), rel=1e-8)
-    joint = _evidence(results, name).joint
+    joint = _evidence(results, name).map.joint
     assert joint.pose[2] + joint.map[2] == pytest.approx(rows["joint_nees"].sum() + pose)
     evidence = _evidence(results, name)
-    for j, label in enumerate(evidence.landmarks):
+    for j, label in enumerate(evidence.map.landmarks):
         mean = rows[rows["landmark"] == label][["x", "y", "z"]].to_numpy()[0]
-        assert_allclose(evidence.error[2, j], trial.landmarks[label] - mean)
+        assert_allclose(evidence.errors.error[2, j], trial.landmarks[label] - mean)
 
 
 def test_landmarks_in_a_plane_have_two_dimensions_in_the_joint_error():
@@ -267,13 +269,13 @@ def test_landmarks_that_only_some_runs_saw_count_in_the_joint_nees_alone(results
     label = results.map["landmark"].iloc[0]
     rare = replace(results, map=results.map[(results.map["landmark"] != label) | (results.map["run"] == 0)])
     whole, part = (_evidence(r, "ekf-uvd") for r in (results, rare))
-    assert label in whole.landmarks
-    assert label not in part.landmarks
-    assert part.joint.dof[0] == part.joint.dof[1] + 3
+    assert label in whole.map.landmarks
+    assert label not in part.map.landmarks
+    assert part.map.joint.dof[0] == part.map.joint.dof[1] + 3
 
 
 def test_the_pose_beside_a_map_is_that_of_its_own_run(results):
     later = replace(results, map=results.map[results.map["run"] > 1])
     whole, part = (_evidence(r, "ekf-uvd") for r in (results, later))
     assert_array_equal(part.run_numbers, [2, 3, 4, 5])
-    assert_array_equal(part.joint.pose, whole.joint.pose[2:])
+    assert_array_equal(part.map.joint.pose, whole.map.joint.pose[2:])

@@ -7,7 +7,7 @@ import pytest
 
 from consistency.bench.runs import montecarlo, results_to_records
 from consistency.commands.app import main
-from consistency.diagnostics import Record
+from consistency.diagnostics import make_record
 
 
 def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
@@ -20,7 +20,7 @@ def test_a_pilot_runs_what_it_is_told(monkeypatch, capsys):
 
     def records_of_results(results, filters):
         asked.append((results, filters))
-        return (Record(name, nees=nees, dof=3, t=np.arange(5.0)) for name in filters)
+        return (make_record(name, nees=nees, dof=3, t=np.arange(5.0)) for name in filters)
 
     monkeypatch.setattr(montecarlo, "run_trials", run_trials)
     monkeypatch.setattr(results_to_records, "records_of_results", records_of_results)

@@ -17,6 +17,7 @@ import pytest
 from edited import change_manifest
 from numpy.testing import assert_allclose, assert_array_equal
 from painted import by_title, lines, panels, places, shaded, titles
+from records import changed
 from scipy import stats
 from scripts import figures
 
@@ -34,7 +35,7 @@ from consistency.bench.pages.sections.study_sections import without_truth
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.runs.reproduce_findings import Finding
 from consistency.bench.store.results import read_results
-from consistency.diagnostics import Answer, Interval, Record, Settings, judge
+from consistency.diagnostics import Answer, Interval, Settings, judge, make_record
 from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics.verdict.parts import DIRECTION, STATUSES, STEP
 from consistency.referee.diagnostics.words.numbers import short
@@ -102,7 +103,7 @@ def drawn(seed, runs=60, size=1.0):
 
 def judged(track, error, covariance, settings=SURE, **given):
     """The track with the verdict on other errors in place of its own."""
-    evidence = Record(track.name, error, covariance, axes=("x", "y", "heading"), **given)
+    evidence = make_record(track.name, error, covariance, axes=("x", "y", "heading"), **given)
     verdict = judge(evidence, settings)
     assert verdict.scale is not None
     assert verdict.location is not None
@@ -319,7 +320,7 @@ def test_a_verdict_without_figures_is_drawn_all_the_same(report, all_steps_faile
     def bare(track):
         v = replace(track.verdict, answers=(), **EMPTY)
         if all_steps_failed:
-            v = judge(Record(track.name, np.full((4, STEPS, 3), np.nan), np.full((4, STEPS, 3, 3), np.nan)))
+            v = judge(make_record(track.name, np.full((4, STEPS, 3), np.nan), np.full((4, STEPS, 3, 3), np.nan)))
             v = replace(v, answers=())
             assert v.status == "failed"
             assert np.isnan(v.scale.inflation.value)
@@ -336,7 +337,7 @@ def test_a_verdict_without_figures_is_drawn_all_the_same(report, all_steps_faile
 
 def test_nees_alone_without_axes(report):
     (study,) = report.studies
-    whole = judge(Record("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
+    whole = judge(make_record("nees", nees=np.random.default_rng(0).chisquare(3, (30, 60)), dof=3))
     track = replace(study.tracks[0], verdict=whole)
     study = replace(study, tracks=(track,))
     (part,) = ratio_figures.forests(study)
@@ -493,7 +494,7 @@ def test_without_truth_only_a_declared_optimal_gain_is_put_to_the_test(report):
     nis, dof = rng.chisquare(4, (1, STEPS)), np.full((1, STEPS), 4)
 
     def by_nis(track, size, optimal):
-        evidence = Record(track.name, nis=size * nis, nis_dof=dof, optimal_gain=optimal)
+        evidence = make_record(track.name, nis=size * nis, nis_dof=dof, optimal_gain=optimal)
         return replace(track, verdict=judge(evidence, SURE))
 
     def text(*tracks):
@@ -550,7 +551,7 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
     error, P = drawn(6, 24)
     lost = (Failure("any", 3, 9, "singular"),)
     late, early, whole = (
-        judge(Record("any", error[:runs], P[:runs], failures=failures))
+        judge(make_record("any", error[:runs], P[:runs], failures=failures))
         for runs, failures in ((24, lost), (12, ()), (24, ()))
     )
     assert anees.common({"early": early, "late": late}) is late
@@ -799,7 +800,7 @@ def test_a_long_study_takes_a_third_of_a_megabyte_of_a_page(results, tmp_path):
     def long(track):
         scale = replace(track.verdict.scale, anees=peak, band=np.tile([2.0, 4.0], (steps, 1)))
         location = replace(track.verdict.location, simultaneous=np.tile([1.0, 5.0], (steps, 1)))
-        shown = replace(
+        shown = changed(
             track.shown, runs=np.zeros(1, int), t=np.arange(1.0, steps + 1), error=rng.random((1, steps, 3)),
             covariance=np.tile(np.eye(3), (1, steps, 1, 1)),
         )  # fmt: skip
@@ -938,11 +939,11 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
 def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(report):
     (study,) = report.studies
     track = study.tracks[0]
-    nees = track.record().nees.copy()
+    nees = track.record().errors.nees.copy()
     nees[[0, 2]] *= 1e4
     scale = replace(track.verdict.scale, median_run=2.5, worst_run=3e4, mean_anees=4321.0)
     verdict = replace(track.verdict, scale=scale)
-    far = replace(track, verdict=verdict, record=lambda: replace(track.record(), nees=nees))
+    far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
     changed = replace(study, tracks=(far, *study.tracks[1:]))
     curves = anees.read(changed).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)

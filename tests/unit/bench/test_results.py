@@ -104,15 +104,15 @@ def test_nees_is_null_only_while_the_pose_is_not_of_full_rank(results):
 
 def test_a_record_puts_every_row_in_its_place(results):
     c = record_of(results, "sleepy")
-    assert c.nees.shape == (4, 60)
-    assert np.array_equal(np.isfinite(c.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
+    assert c.errors.nees.shape == (4, 60)
+    assert np.array_equal(np.isfinite(c.errors.nees), np.broadcast_to(np.arange(60) < 4, (4, 60)))
     assert [(failure.run, failure.step) for failure in c.failures] == [(0, 5), (1, 5), (2, 5), (3, 5)]
     row = results.estimates.query("filter == 'sleepy' and run == 2 and step == 3").iloc[0]
     true = results.truth.query("run == 2 and step == 3").iloc[0]
-    assert c.error[2, 2, 0] == true["x"] - row["x"]
-    assert c.covariance[2, 2, 0, 2] == c.covariance[2, 2, 2, 0] == row["P_xh"]
-    assert c.nees[2, 2] == row["nees"]
-    assert np.allclose(record_of(results, "ekf-xyz").t, 0.1 * np.arange(1, 61))
+    assert c.errors.error[2, 2, 0] == true["x"] - row["x"]
+    assert c.errors.covariance[2, 2, 0, 2] == c.errors.covariance[2, 2, 2, 0] == row["P_xh"]
+    assert c.errors.nees[2, 2] == row["nees"]
+    assert np.allclose(record_of(results, "ekf-xyz").runs.t, 0.1 * np.arange(1, 61))
     with pytest.raises(cs.InputError, match="filter 'kf' is not in these results; there are: ekf-xyz, sleepy"):
         record_of(results, "kf")
 

@@ -9,13 +9,14 @@ import pandas as pd
 import pytest
 from draws import autoregression, identities
 from numpy.testing import assert_allclose, assert_array_equal
+from records import changed
 from scipy import linalg
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import consistency as cs
 from consistency.commands.app import app
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions import residuals_of_fit
 from consistency.referee.diagnostics.questions.residuals_of_fit import (
     _at_most,
@@ -392,7 +393,7 @@ def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng):
     error = rng.normal(size=(60, 20, 3))
     for unseen, status in ((0.0, "consistent"), (0.1, "consistent"), (0.4, "undecided"), (1.0, "undecided")):
         v = judge(
-            Record("f", error, identities(error), reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen),
+            changed(make_record("f", error, identities(error)), reduced=True, unavailable=ALL_BUT_SCALE, unseen=unseen),
             Settings(1e-6),
         )
         assert v.status == status
@@ -486,10 +487,10 @@ def test_files_are_aligned_whatever_numbers_them(step, tmp_path, rng):
     record = read(tmp_path, "posyaw")
     verdict = cs.judge(record, false_alarm=1e-6)
     assert verdict.status == "consistent"  # 480 steps: their ratio is 1 to 4 %, and shown to lie within 50 %
-    assert verdict.align == record.align == "posyaw"
+    assert verdict.align == record.fit.align == "posyaw"
     assert "aligned by posyaw, a frame of 3 degrees of freedom for each run: what is constant" in verdict.reasons[0]
     assert {a.question for a in verdict.answers} == {"scale"}
-    assert np.nanmean(record.nees) == pytest.approx(3.0, abs=0.6)  # 1,440 squares: 5 of its spread of 0.11
+    assert np.nanmean(record.errors.nees) == pytest.approx(3.0, abs=0.6)  # 1,440 squares: 5 of its spread of 0.11
     plain = cs.judge(read(tmp_path, "none"))
     assert plain.status == "overconfident"
     assert plain.align == "none"
@@ -511,19 +512,19 @@ def test_a_frame_of_each_run_hides_no_covariance_that_is_too_small(tmp_path, rng
 def test_few_runs_are_said_to_be_few(tmp_path, rng):
     tables(tmp_path, rng, 5, 1.0, "all")
     record = read(tmp_path, "posyaw-all")
-    assert record.reduced
-    assert any("fewer than 20 runs do not show what the frame takes" in note for note in record.notes)
+    assert record.fit.reduced
+    assert any("fewer than 20 runs do not show what the frame takes" in note for note in record.origin.notes)
 
 
 def test_questions_without_an_answer_are_not_asked(rng):
     error = rng.normal(size=(30, 20, 3))
     error[:, 3] += 5.0
     P = identities(error)
-    every = judge(Record("f", error, P))
+    every = judge(make_record("f", error, P))
     assert "bias in some step" in every.faults
-    some = judge(Record("f", error, P, reduced=True, unavailable=ALL_BUT_SCALE))
+    some = judge(changed(make_record("f", error, P), reduced=True, unavailable=ALL_BUT_SCALE))
     assert {a.question for a in some.answers} == {"scale"}
-    low = judge(Record("f", 0.3 * rng.normal(size=(30, 20, 3)), P, reduced=True))
+    low = judge(changed(make_record("f", 0.3 * rng.normal(size=(30, 20, 3)), P), reduced=True))
     assert low.status == "undecided"
     assert not low.equivalence.one_sided
     assert low.equivalence.runs is None
@@ -534,7 +535,7 @@ def test_where_the_scale_is_asked_alone_it_has_the_whole_rate(rng):
     w = rng.normal(size=(40, 10, 3))
     P = identities(w)
     for ratio in np.linspace(0.9, 1.5, 120):
-        v = judge(Record("f", np.sqrt(ratio) * w, P, reduced=True, unavailable=ALL_BUT_SCALE), Settings())
+        v = judge(changed(make_record("f", np.sqrt(ratio) * w, P), reduced=True, unavailable=ALL_BUT_SCALE), Settings())
         (answer,) = v.answers
         if 0.026 < answer.p_value < 0.049:
             assert v.status == "overconfident"

@@ -47,12 +47,12 @@ def test_a_bag_is_read_to_the_last_digits(tmp_path, ros, kind, topic, truth):
     drive = Drive()
     bag = write(tmp_path / ("drive.bag" if ros == 1 else "drive"), ros, kind, drive)
     [r] = read_recordings(bag, topic=topic, truth_topic=truth)
-    assert_allclose(r.error[0], drive.error, atol=1e-6)
-    assert_allclose(r.covariance[0], np.broadcast_to(P, (STEPS, 6, 6)))
-    assert_allclose(r.t, START + drive.t)  # the stamps, not the times of writing
-    assert r.convention == "so3"
+    assert_allclose(r.errors.error[0], drive.error, atol=1e-6)
+    assert_allclose(r.errors.covariance[0], np.broadcast_to(P, (STEPS, 6, 6)))
+    assert_allclose(r.runs.t, START + drive.t)  # the stamps, not the times of writing
+    assert r.errors.convention == "so3"
     [alone] = read_recordings(bag, truth_topic=truth)  # one topic has covariances
-    assert np.array_equal(alone.error, r.error)  # type: ignore[arg-type]
+    assert np.array_equal(alone.errors.error, r.errors.error)  # type: ignore[arg-type]
 
 
 def test_one_command_from_bag_to_picture(tmp_path, capsys):
@@ -67,10 +67,10 @@ def test_a_folder_of_bags_has_a_run_in_each(tmp_path):
     for seed in range(4):
         write(tmp_path / "bags" / f"{seed}.bag", 1, "pose", Drive(seed))
     [r] = read_recordings(tmp_path / "bags", truth_topic="/vicon")
-    assert r.runs.tolist() == [0, 1, 2, 3]
+    assert r.runs.numbers.tolist() == [0, 1, 2, 3]
     for seed in range(4):
-        assert_allclose(r.error[seed], Drive(seed).error, atol=1e-6)
-    assert cs.read(tmp_path / "bags", truth_topic="/vicon", axes=["x", "yaw"]).axes == ("x", "yaw")
+        assert_allclose(r.errors.error[seed], Drive(seed).error, atol=1e-6)
+    assert cs.read(tmp_path / "bags", truth_topic="/vicon", axes=["x", "yaw"]).errors.axes == ("x", "yaw")
 
 
 def test_bags_of_a_program_are_deleted_once_they_are_read(tmp_path, monkeypatch, capsys):
@@ -99,10 +99,10 @@ def test_a_robot_in_the_plane_is_judged_in_the_plane(tmp_path, variances, unstat
     drive.own[:, 3:] = turn.as_quat()
     drive.P = np.diag([0.01, 0.04, *variances, 9e-4])
     [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
-    assert r.axes == ("x", "y", "yaw")
+    assert r.errors.axes == ("x", "y", "yaw")
     left = "roll, pitch" if unstated else "z, roll, pitch"
-    assert any(f"{left} are not estimated and left out" in note for note in r.notes)
-    assert any(f"the variances of {unstated} are 0, -1" in note for note in r.notes) == bool(unstated)
+    assert any(f"{left} are not estimated and left out" in note for note in r.origin.notes)
+    assert any(f"the variances of {unstated} are 0, -1" in note for note in r.origin.notes) == bool(unstated)
 
 
 def planar_bags(folder, dummies, *, late=0.0, count=4):
@@ -126,16 +126,16 @@ def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_any_dummy(tmp_
     """An offset of 0.35 s makes an error of 0.3 m and 0.1 rad; without it NEES is 3, of 600: 0.5 is 5 sigma."""
     bags = planar_bags(tmp_path / "bags", dummies, late=0.35)
     [late] = read_recordings(bags, truth_topic="/vicon")
-    assert late.axes == ("x", "y", "yaw")
-    notes = " ".join(late.notes)
+    assert late.errors.axes == ("x", "y", "yaw")
+    notes = " ".join(late.origin.notes)
     assert "by --axes x,y,yaw" in notes
     offset = float(notes.split("--time-offset ")[1].split()[0])
     assert offset == pytest.approx(0.35, abs=0.01)
     [right] = read_recordings(bags, truth_topic="/vicon", time_offset=offset)
     [found] = read_recordings(bags, truth_topic="/vicon", time_offset="estimate", axes=["x", "y", "yaw"])
     for record in (right, found):
-        assert record.axes == ("x", "y", "yaw")
-        assert 2.5 < np.nanmean(record.nees) < 3.5
+        assert record.errors.axes == ("x", "y", "yaw")
+        assert 2.5 < np.nanmean(record.errors.nees) < 3.5
 
 
 @pytest.mark.parametrize("name", ["speed", "turn_rate", "linear_y", "angular_z"])
@@ -154,7 +154,7 @@ def test_the_twist_of_odometry_makes_groups(tmp_path, name):
         "linear_y": linear[:, 1],
         "angular_z": angular[:, 2],
     }
-    assert_allclose(r.by[0], expected[name], rtol=1e-12)
+    assert_allclose(r.runs.by[0], expected[name], rtol=1e-12)
     assert len(r.groups.names) == 5
 
 
@@ -171,7 +171,7 @@ def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
     drive.t = drive.t.copy()
     drive.t[5] = drive.t[4]
     [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
-    assert_allclose(r.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
+    assert_allclose(r.errors.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_a_file_of_ros_2_without_its_metadata(tmp_path, suffix):
     [file] = write(tmp_path / "drive", 2, "pose", drive, suffix).glob(f"*{suffix}")
     alone = file.rename(tmp_path / f"flight{suffix}")
     [r] = read_recordings(alone, truth_topic="/vicon")
-    assert_allclose(r.error[0], drive.error, atol=1e-6)  # type: ignore[index]
+    assert_allclose(r.errors.error[0], drive.error, atol=1e-6)  # type: ignore[index]
     (tmp_path / "parts").mkdir()
     for k in range(2):
         (tmp_path / "parts" / f"flight_{k}{suffix}").write_bytes(alone.read_bytes())
@@ -255,10 +255,11 @@ def test_fixes_against_fixes(tmp_path):
     turns = axes_at(place[0]) @ np.swapaxes(axes_at(off[kept]), 1, 2)
     stated = turns @ C[kept] @ np.swapaxes(turns, 1, 2)
     nees = [each @ np.linalg.solve(M, each) for each, M in zip(e, stated, strict=True)]
-    assert_allclose(r.nees[0], nees, rtol=1e-6, atol=1e-6)  # metres are differences of millions of them
-    assert any("/fix read as positions by satellite, 11 of 12 messages with a fix" in note for note in r.notes)
+    assert_allclose(r.errors.nees[0], nees, rtol=1e-6, atol=1e-6)  # metres are differences of millions of them
+    assert any("/fix read as positions by satellite, 11 of 12 messages with a fix" in note for note in r.origin.notes)
     assert any(
-        "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in note for note in r.notes
+        "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in note
+        for note in r.origin.notes
     )
 
 
@@ -268,8 +269,8 @@ def test_the_type_of_a_covariance_counts(tmp_path):
     place, C = flight()
     off = place + np.array([1e-7, 1e-7, 0.01])
     [r] = read_recordings(write_fixes(tmp_path / "a.bag", 2, off, place, C), topic="/fix", truth_topic="/rtk")
-    assert r.parts == ((0,), (1,), (2,))
-    stated = np.asarray(r.covariance[0])
+    assert r.errors.parts == ((0,), (1,), (2,))
+    stated = np.asarray(r.errors.covariance[0])
     assert_allclose(stated, C * np.eye(3), atol=1e-3 * stated.max())  # what is beside the diagonal is not
     bag = write_fixes(tmp_path / "b.bag", 0, off, place, C)
     with pytest.raises(cs.InputError, match=r"b\.bag: states no covariance: its variances are 0, -1"):
@@ -283,16 +284,16 @@ def test_blocks_that_are_not_stated_are_not_judged(tmp_path, value):
     drive.P[3:, 3:] = value * np.eye(3)
     bag = write(tmp_path / "a.bag", 1, "pose", drive)
     [r] = read_recordings(bag, truth_topic="/vicon")
-    assert r.axes == ("x", "y", "z")
-    assert_allclose(r.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
+    assert r.errors.axes == ("x", "y", "z")
+    assert_allclose(r.errors.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
     said = "the variances of roll,pitch,yaw are 0, -1 or 1e+09 in every message, so not stated and not judged"
-    assert any(said in note for note in r.notes)
+    assert any(said in note for note in r.origin.notes)
 
 
 def test_other_frames_are_named(tmp_path):
     [r] = read_recordings(write(tmp_path / "a.bag", 1, "odometry", Drive()), truth_topic="map:body")
-    assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.notes)
-    assert not any("the world is" in note for note in r.notes)
+    assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.origin.notes)
+    assert not any("the world is" in note for note in r.origin.notes)
 
 
 def test_the_covariance_of_a_true_message(tmp_path):
@@ -301,9 +302,9 @@ def test_the_covariance_of_a_true_message(tmp_path):
     place, C = flight()
     bag = write_fixes(tmp_path / "a.bag", 3, place + np.array([1e-7, 1e-7, 0.01]), place, C)
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk", truth_covariance="columns")
-    assert_allclose(r.truth_covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
+    assert_allclose(r.truth.covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk")
-    assert any("/rtk" not in note and "which counts as 0" in note for note in r.notes)
+    assert any("/rtk" not in note and "which counts as 0" in note for note in r.origin.notes)
     drive = write(tmp_path / "b.bag", 1, "odometry", Drive())
     for value, said in (("P.txt", "with a bag it is 'columns'"), ("columns", "the messages of map:body state none")):
         with pytest.raises(cs.InputError, match=said):

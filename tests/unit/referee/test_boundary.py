@@ -53,7 +53,7 @@ def test_an_estimate_beyond_all_measure_is_a_failed_run(files, value):
     recording = read(path, truth=files / "table" / "truth.csv")
     assert [(failure.run, failure.step) for failure in recording.failures] == [(0, 6)]
     assert "not finite" in recording.failures[0].reason
-    assert np.nanmax(recording.nees) < 1e6
+    assert np.nanmax(recording.errors.nees) < 1e6
 
 
 def test_a_truth_beyond_all_measure_is_refused(files):
@@ -130,7 +130,7 @@ def test_a_packed_archive_holds_the_same(files, method):
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(files / "packed.npz", "w", method) as new:
         for name in old.namelist():
             new.writestr(name, old.read(name))
-    assert np.array_equal(read(files / "packed.npz").nees, read(path).nees)
+    assert np.array_equal(read(files / "packed.npz").errors.nees, read(path).errors.nees)
 
 
 @pytest.mark.parametrize("key", ["errors", "covariances", "nis", "nis_dof"])

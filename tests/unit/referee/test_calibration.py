@@ -202,12 +202,12 @@ def test_poses_have_exactly_the_left_invariant_errors_that_were_drawn(tmp_path):
     path = tmp_path / "poses.npz"
     np.savez(path, estimates=estimate, truth=truth, covariances=covariance)
     (read,) = read_recordings(path, error="left")
-    assert_array_equal(recording.error, read.error)
-    assert_array_equal(recording.covariance, read.covariance)
-    assert_array_equal(recording.nees, read.nees)
+    assert_array_equal(recording.errors.error, read.errors.error)
+    assert_array_equal(recording.errors.covariance, read.errors.covariance)
+    assert_array_equal(recording.errors.nees, read.errors.nees)
     assert recording.failures == read.failures == ()
     (other,) = read_recordings(path, error="so2")
-    assert np.abs(other.error - read.error).max() > 0.01
+    assert np.abs(other.errors.error - read.errors.error).max() > 0.01
 
 
 def test_an_estimate_less_its_error_is_the_truth():

@@ -35,7 +35,7 @@ def test_run_means_are_those_of_a_right_filter():
 
 def test_errors_of_gates_have_the_same_run_means():
     evidence = spread._evidence(np.random.default_rng(7), 6, 2, 0.5, 200)
-    constant = np.ptp(evidence.error, axis=1) == 0
+    constant = np.ptp(evidence.errors.error, axis=1) == 0
     assert (constant[:, 0] == constant[:, 1]).all()
     assert not constant[:, 2:].any()
     assert 60 < constant[:, 0].sum() < 140  # 5.6 standard errors

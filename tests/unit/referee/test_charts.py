@@ -107,7 +107,7 @@ def test_files_of_such_covariances_are_consistent(convention, tmp_path, rng):
     write_runs(tmp_path, convention, rng)
     record = cs.read(tmp_path / "est", tmp_path / "truth", error=convention, time_offset=0.0)
     assert cs.judge(record, false_alarm=1e-5).status in ("consistent", "undecided")
-    assert record.nees.mean() == pytest.approx(6.0, abs=5.0 * np.sqrt(12.0 / 200))
+    assert record.errors.nees.mean() == pytest.approx(6.0, abs=5.0 * np.sqrt(12.0 / 200))
 
 
 def test_calibrations_that_are_independent_are_consistent(rng):

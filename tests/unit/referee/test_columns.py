@@ -233,10 +233,10 @@ def test_other_names_of_a_heading_change_nothing_else(inside):
         found.append(read_recordings(Path(name), Path("truth.csv"), by="light"))
     for own, other in zip(*found, strict=True):
         assert (own.name, own.run_numbers.tolist()) == (other.name, [0, 1])
-        assert_allclose(other.nees, own.nees, rtol=1e-12)
-        assert_allclose(other.nis, own.nis)
+        assert_allclose(other.errors.nees, own.errors.nees, rtol=1e-12)
+        assert_allclose(other.innovations.nis, own.innovations.nis)
         assert other.groups.names == own.groups.names
-    assert any("theta.csv: read as planar poses" in note for note in found[1][0].notes)
+    assert any("theta.csv: read as planar poses" in note for note in found[1][0].origin.notes)
 
 
 def test_speeds_of_several_runs_are_refused(inside):
@@ -256,7 +256,7 @@ def test_a_nis_that_cannot_be_is_refused_with_its_place(inside):
         cs.read("a.npz")
     nis[1, 2] = np.nan
     np.savez("a.npz", nis=nis, nis_dof=np.where(np.isnan(nis), -1, 2), **rows)
-    assert cs.read("a.npz").nis_dof[1].tolist() == [2, 2, 0, 2]
+    assert cs.read("a.npz").innovations.nis_dof[1].tolist() == [2, 2, 0, 2]
     plane("heading", nis=np.arange(6.0) - 1.0, nis_dof=2).to_csv("est.csv", index=False)
     plane("heading").to_csv("truth.csv", index=False)
     with pytest.raises(cs.InputError, match=r"est\.csv, line 2: nis -1 with nis_dof 2"):

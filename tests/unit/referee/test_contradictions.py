@@ -7,7 +7,7 @@ import pytest
 from draws import autoregression, identities, independent, verdict_on
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.words.numbers import short
 
 SURE = 1e-5
@@ -33,13 +33,13 @@ def test_a_ratio_says_the_steps_that_it_is_of(begin, rng):
 def test_times_of_a_clock_are_told_from_the_start(start, rng):
     error = independent(rng, 60, 40, 3)
     error[:, 20:] *= 3.0
-    record = Record("f", error, np.array(identities(error)), t=start + 0.1 * np.arange(40), files={0: "a.csv"})
+    record = make_record("f", error, np.array(identities(error)), t=start + 0.1 * np.arange(40), files={0: "a.csv"})
     (sentence, *_) = judge(record, Settings(SURE)).reasons
     assert "since step 21 (2 s after the start)" in sentence
     error[:, 30:] /= 3.0
     (sentence, *_) = judge(record, Settings(SURE)).reasons
     assert "in steps 21 to 30 (2 to 2.9 s after the start)" in sentence
-    record = Record("f", error, np.array(identities(error)), t=100.0 + 0.1 * np.arange(40), files={0: "a.csv"})
+    record = make_record("f", error, np.array(identities(error)), t=100.0 + 0.1 * np.arange(40), files={0: "a.csv"})
     assert "in steps 21 to 30 (102 to 102.9 s)" in judge(record, Settings(SURE)).reasons[0]
 
 

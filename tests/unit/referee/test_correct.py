@@ -5,11 +5,12 @@ from dataclasses import replace
 import calibration_lengths as lengths
 import numpy as np
 import pytest
+from records import changed
 from scipy import optimize, stats
 
 import consistency as cs
 from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import make_record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct import (
@@ -60,7 +61,7 @@ def drawn(rng, C, rho=0.0):
 
 def record_of(error, P, axes=()):
     n = error.shape[-1]
-    return Record("est", error, P, nees(error, P), n, axes=axes or POSE[:n], runs=np.arange(len(error)))
+    return make_record("est", error, P, nees(error, P), n, axes=axes or POSE[:n], runs=np.arange(len(error)))
 
 
 def wrong(rng, runs=24, steps=40, factor=9.0, turn=0.5, rho=0.5):
@@ -93,13 +94,13 @@ def test_one_factor_is_the_mean_nees_of_steps(rng):
     P[1, 4:] = np.nan
     values = np.full((5, 7), np.nan)
     values[np.isfinite(error[..., 0])] = nees(error[np.isfinite(error[..., 0])], P[np.isfinite(error[..., 0])])
-    record = replace(
+    record = changed(
         record_of(np.ones((5, 7, 3)), np.broadcast_to(np.eye(3), (5, 7, 3, 3)).copy()),
         error=error,
         covariance=P,
         nees=values,
     )
-    fit = fit_alone(record, blocks_of(record.axes, 3, False))
+    fit = fit_alone(record, blocks_of(record.errors.axes, 3, False))
     assert fit.factors.factor == pytest.approx([np.nanmean(values) / 3])
     assert fit.left_out[2].factor == pytest.approx([np.nanmean(np.delete(values, 2, axis=0)) / 3])
 
@@ -107,9 +108,9 @@ def test_one_factor_is_the_mean_nees_of_steps(rng):
 def test_factors_are_the_most_likely_ones(rng):
     record = wrong(rng, runs=4)
     blocks = blocks_of(POSE, 6, False)
-    assert record.covariance is not None
-    assert record.error is not None
-    P, e = record.covariance, record.error
+    assert record.errors.covariance is not None
+    assert record.errors.error is not None
+    P, e = record.errors.covariance, record.errors.error
 
     def loss(logs):
         C = Factors(blocks, np.exp(logs), np.zeros(2)).applied(P)
@@ -129,9 +130,9 @@ def test_factors_of_any_size_are_found(rng):
 
 def test_runs_are_the_unit(rng):
     record = wrong(rng, runs=6, steps=10)
-    assert record.error is not None
-    assert record.covariance is not None
-    twice = record_of(np.repeat(record.error, 3, axis=1), np.repeat(record.covariance, 3, axis=1))
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    twice = record_of(np.repeat(record.errors.error, 3, axis=1), np.repeat(record.errors.covariance, 3, axis=1))
     once, again = (fit_runs(each, blocks_of(POSE, 6, False)) for each in (record, twice))
     for one, other in zip(once.factor, again.factor, strict=True):
         assert tuple(one) == pytest.approx(tuple(other), rel=1e-6)
@@ -151,11 +152,11 @@ def test_a_covariance_is_scaled_by_blocks():
 
 def test_a_run_has_no_say_in_its_own_factors(rng):
     record = wrong(rng, runs=6)
-    assert record.error is not None
-    assert record.covariance is not None
-    error = record.error.copy()
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    error = record.errors.error.copy()
     error[3] *= 20.0
-    one, other = (correct(each) for each in (record, record_of(error, record.covariance)))
+    one, other = (correct(each) for each in (record, record_of(error, record.errors.covariance)))
     assert other.used[3][0].factor == pytest.approx(one.used[3][0].factor, rel=1e-9)
     assert (other.used[2][0].factor > 2 * one.used[2][0].factor).all()
 
@@ -175,13 +176,13 @@ def test_known_factors_are_found_and_judged_right():
 
 def test_the_gain_is_of_log_densities(rng):
     record = wrong(rng, runs=3, steps=5)
-    assert record.error is not None
-    assert record.covariance is not None
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
     scores_of = held_out_by(record).scores
     for run in range(3):
         density = [
             stats.multivariate_normal.logpdf(e, np.zeros(6), P)
-            for e, P in zip(record.error[run], record.covariance[run], strict=True)
+            for e, P in zip(record.errors.error[run], record.errors.covariance[run], strict=True)
         ]
         assert scores_of[run] == pytest.approx(np.mean(density))
 
@@ -203,10 +204,10 @@ def test_uncertain_factors_lengthen_no_tails():
     error = np.zeros((1, 4, 3))
     error[0, :, 1] = np.sqrt(squares)
     record = record_of(error, np.broadcast_to(np.eye(3), (1, 4, 3, 3)).copy())
-    blocks = blocks_of(record.axes, 3, False)
+    blocks = blocks_of(record.errors.axes, 3, False)
     found = with_uncertainty(record, blocks, np.array([[8.0]]))
-    assert found.nees is not None
-    assert found.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
+    assert found.errors.nees is not None
+    assert found.errors.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
 
 
 def test_what_few_runs_add_is_what_a_ratio_has_more():
@@ -238,12 +239,12 @@ def test_few_runs_are_undecided_after_and_say_how_many_would_decide():
 
 def test_what_no_factor_mends_is_named(rng):
     record = wrong(rng, runs=40, rho=0.0)
-    assert record.error is not None
-    assert record.covariance is not None
-    heavy = record.error * np.sqrt(2.0 / rng.chisquare(2.0, (40, 40, 1)))
-    biased = record.error + 3.0 * np.sqrt(np.diagonal(record.covariance, axis1=2, axis2=3))
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    heavy = record.errors.error * np.sqrt(2.0 / rng.chisquare(2.0, (40, 40, 1)))
+    biased = record.errors.error + 3.0 * np.sqrt(np.diagonal(record.errors.covariance, axis1=2, axis2=3))
     for error, word in ((heavy, "heavy"), (biased, "mean error")):
-        found = correct(record_of(error, record.covariance))
+        found = correct(record_of(error, record.errors.covariance))
         assert found.status == "inconsistent"
         assert word in found.verdict.reasons[0]
         assert "no factor mends this" in repr(found)
@@ -251,11 +252,11 @@ def test_what_no_factor_mends_is_named(rng):
 
 def test_a_run_that_failed_from_the_start_counts(rng):
     record = wrong(rng, runs=8)
-    assert record.error is not None
-    assert record.nees is not None
-    error, values = record.error.copy(), record.nees.copy()
+    assert record.errors.error is not None
+    assert record.errors.nees is not None
+    error, values = record.errors.error.copy(), record.errors.nees.copy()
     error[2], values[2] = np.nan, np.nan
-    broken = replace(record, error=error, nees=values, failures=(Failure("est", 2, 1, "estimate is not finite"),))
+    broken = changed(record, error=error, nees=values, failures=(Failure("est", 2, 1, "estimate is not finite"),))
     found = correct(broken)
     assert found.status == "inconsistent"
     assert found.verdict.status == "failed"
@@ -298,7 +299,7 @@ def test_a_floor_is_found_where_it_is():
     """Fails by chance in fewer than 1 in 1e4: 5 standard errors."""
     rng = np.random.default_rng()
     record = with_floor(rng, 2.0, 20.0)
-    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    fit = fit_runs(record, blocks_of(record.errors.axes, 3, False))
     for value, interval, true in (
         (fit.factors.factor[0], fit.factor[0], 2.0),
         (fit.factors.floor[0], fit.floor[0], 20.0),
@@ -311,7 +312,7 @@ def test_a_floor_is_found_where_it_is():
 def test_no_floor_is_kept_that_data_do_not_ask_for():
     rng = np.random.default_rng(5)
     record = with_floor(rng, 2.0, 0.0)
-    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    fit = fit_runs(record, blocks_of(record.errors.axes, 3, False))
     assert fit.factors.floor.tolist() == [0.0]
     assert fit.floor[0].low == 0.0
     assert fit.floor[0].high > 0.0
@@ -322,7 +323,7 @@ def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval():
     rng = np.random.default_rng(2)
     P = covariances(rng, 20, 40, 3)
     record = record_of(drawn(rng, np.broadcast_to(50.0 * np.eye(3), P.shape).copy()), P)
-    fit = fit_runs(record, blocks_of(record.axes, 3, False))
+    fit = fit_runs(record, blocks_of(record.errors.axes, 3, False))
     assert fit.factors.floor[0] == pytest.approx(50.0, rel=0.2)
     assert fit.factor[0].low == 0.0
     assert 0.0 < fit.factor[0].high < 2.0
@@ -331,7 +332,7 @@ def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval():
 def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng):
     P = np.broadcast_to(2.0 * np.eye(3), (6, 20, 3, 3)).copy()
     record = record_of(drawn(rng, 3.0 * P), P)
-    blocks = blocks_of(record.axes, 3, False)
+    blocks = blocks_of(record.errors.axes, 3, False)
     assert likeness(record, blocks[0]) == pytest.approx(1.0)
     fit = fit_runs(record, blocks)
     assert fit.factors.floor.tolist() == [0.0]
@@ -359,7 +360,9 @@ def test_sizes_by_other_factors_are_those_of_the_covariances(rng):
     other = Factors(blocks, np.array([3.0, 0.9]), np.array([0.5, 0.6]))
     expected = np.zeros(2)
     for b, block in enumerate(blocks):
-        ratios = np.linalg.inv(block.of(whole.applied(record.covariance))) @ block.of(other.applied(record.covariance))
+        ratios = np.linalg.inv(block.of(whole.applied(record.errors.covariance))) @ block.of(
+            other.applied(record.errors.covariance)
+        )
         expected[b] = np.trace(ratios, axis1=-2, axis2=-1).mean() / 3
     assert relative_sizes(record, whole, [other])[0] == pytest.approx(expected)
 
@@ -425,17 +428,17 @@ def ragged(rng, runs=20, steps=30):
     """A right estimator whose runs have unlike numbers of steps, none of which depends on the errors."""
     P = covariances(rng, runs, steps, 3)
     record = record_of(drawn(rng, P), P)
-    assert record.nees is not None
+    assert record.errors.nees is not None
     counted = np.arange(steps) < rng.integers(2, steps + 1, runs)[:, None]
-    return replace(record, nees=np.where(counted, record.nees, np.nan))
+    return changed(record, nees=np.where(counted, record.errors.nees, np.nan))
 
 
 def test_runs_count_by_their_steps(rng):
     record = ragged(rng)
-    counts = np.isfinite(record.nees).sum(axis=1)
-    fit = fit_alone(record, blocks_of(record.axes, 3, False))
-    assert fit.factors.factor == pytest.approx(np.nansum(record.nees) / (3 * counts.sum()))
-    others = np.delete(record.nees, 4, axis=0)
+    counts = np.isfinite(record.errors.nees).sum(axis=1)
+    fit = fit_alone(record, blocks_of(record.errors.axes, 3, False))
+    assert fit.factors.factor == pytest.approx(np.nansum(record.errors.nees) / (3 * counts.sum()))
+    others = np.delete(record.errors.nees, 4, axis=0)
     assert fit.left_out[4].factor == pytest.approx(np.nansum(others) / (3 * np.delete(counts, 4).sum()))
     left_out = np.array([each.factor[0] for each in fit.left_out])
     runs = counts.sum() ** 2 / np.square(counts).sum()
@@ -448,9 +451,9 @@ def test_runs_count_by_their_steps(rng):
 
 def test_scores_count_by_steps(rng):
     record = ragged(rng, runs=4)
-    blocks = blocks_of(record.axes, 3, False)
+    blocks = blocks_of(record.errors.axes, 3, False)
     value, gradient, information = scores(record, blocks, np.array([0]), np.array([1.2, 0.1]))
-    counts = np.isfinite(record.nees).sum(axis=1)
+    counts = np.isfinite(record.errors.nees).sum(axis=1)
     for run in range(4):
         alone = scores(record.of_runs(np.array([run])), blocks, np.array([0]), np.array([1.2, 0.1]))
         assert value[run] == pytest.approx(alone[0][0] * counts[run] / counts.mean())
@@ -464,13 +467,13 @@ def test_a_right_filter_needs_no_factor_by_how_its_runs_end(seed):
     record = lengths.measured(np.random.default_rng(seed), lengths.WORLDS["aligned"], 6000)
     fit = fit_alone(record, blocks_of(("x",), 1, False))
     assert fit.chance[0] > 1e-4
-    means = np.nanmean(record.nees, axis=1)
+    means = np.nanmean(record.errors.nees, axis=1)
     assert chance_of_one(means.mean(), (means.sum() - means) / (len(means) - 1)) < 1e-8
 
 
 def test_several_fits_ask_more_of_a_floor():
     record = with_floor(np.random.default_rng(6), 2.0, 20.0)
-    blocks = blocks_of(record.axes, 3, False)
+    blocks = blocks_of(record.errors.axes, 3, False)
     assert fit_runs(record, blocks, 20).factors.floor[0] > 0.0
     assert fit_runs(record, blocks, 10**30).factors.floor[0] == 0.0
 
@@ -482,17 +485,17 @@ def test_groups_have_factors_of_their_own_runs(rng):
     groups = Groups("speed", ("slow", "fast"), index, (1.0,))
     fits = fit_groups(replace(record, groups=groups), blocks_of(POSE, 6, False))
     assert list(fits) == ["slow", "fast", ""]
-    assert record.nees is not None
-    slow = replace(record, nees=np.where(index == 0, record.nees, np.nan))
+    assert record.errors.nees is not None
+    slow = changed(record, nees=np.where(index == 0, record.errors.nees, np.nan))
     assert fits["slow"].factors.factor == pytest.approx(fit_runs(slow, fits[""].factors.blocks).factors.factor)
     assert fits["fast"].factors == fits[""].factors
     assert "fewer than two runs" in fits["fast"].notes[0]
     found = correct(replace(record, groups=groups))
-    assert record.covariance is not None
-    assert found.after.record.covariance is not None
+    assert record.errors.covariance is not None
+    assert found.after.record.errors.covariance is not None
     run, step = (int(each[0]) for each in np.nonzero(index == -1))
-    expected = fits[""].left_out[run].applied(record.covariance[run, step])
-    assert found.after.record.covariance[run, step] == pytest.approx(expected)
+    expected = fits[""].left_out[run].applied(record.errors.covariance[run, step])
+    assert found.after.record.errors.covariance[run, step] == pytest.approx(expected)
 
 
 def test_arrays_are_corrected_in_python(rng):

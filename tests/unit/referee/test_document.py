@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from consistency.diagnostics import Comparison, Interval, MapScore, Record, judge
+from consistency.diagnostics import Comparison, Interval, MapScore, judge, make_record
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.verdict.parts import ABOUT, ALONE, JointScore, RejectionScore
 from consistency.referee.diagnostics.words.sentences import reasons
@@ -171,7 +171,7 @@ def verdict_of(scale, name="f", n=2):
     rng = np.random.default_rng(5)
     error = scale * rng.standard_normal((60, 4, n))
     P = np.broadcast_to(np.eye(n), (60, 4, n, n))
-    return judge(Record(name, error=error, covariance=P, nees=(error**2).sum(-1), dof=n, axes=("x", "y")))
+    return judge(make_record(name, error=error, covariance=P, nees=(error**2).sum(-1), dof=n, axes=("x", "y")))
 
 
 def test_every_view_takes_its_cells_from_the_verdict():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from draws import independent
+from records import changed
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 
 SURE = 1e-5
 AXES = ("x", "y", "vx", "vy")
@@ -36,7 +37,9 @@ def tracking(rng, runs=46, steps=40, start=(4.0, 4.0, 0.25, 0.25)):
 def recorded(error, P, true):
     """A record with true positions (runs, steps, 2)."""
     path = np.stack([true, true - error[..., :2]], axis=2)
-    return Record("kf", error, P, np.einsum("rki,rkij,rkj->rk", error, np.linalg.inv(P), error), axes=AXES, path=path)
+    return changed(
+        make_record("kf", error, P, np.einsum("rki,rkij,rkj->rk", error, np.linalg.inv(P), error), axes=AXES), path=path
+    )
 
 
 def said(verdict):
@@ -48,7 +51,7 @@ def test_an_exact_start_is_conservative_and_not_heavy_tailed(rng, start):
     """Errors of the first steps lie in fewer directions than axes, and so differ more than those of one scale."""
     for _ in range(8):
         error, P = tracking(rng, start=start)
-        verdict = judge(Record("kf", error, P, axes=AXES), Settings())
+        verdict = judge(make_record("kf", error, P, axes=AXES), Settings())
         assert "scale in some step" in verdict.faults
         assert verdict.status in ("conservative", "inconsistent")
 
@@ -80,7 +83,7 @@ def test_heavy_tails_in_a_few_steps_keep_their_name_beside_steps_below_the_band(
     error = independent(rng, 60, 120, 3)
     error[:, 30:36] *= np.where(np.arange(60) % 20 == 0, 12.0, 1.0)[:, None, None]
     error[:, :small] *= 0.3
-    verdict = judge(Record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings())
+    verdict = judge(make_record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings())
     assert verdict.location.steps_below >= small
     assert verdict.status == "heavy-tailed"
 
@@ -89,7 +92,7 @@ def test_heavy_tails_in_a_step_below_the_band_keep_their_name(rng):
     """Errors of step 31 are a tenth as large, but in one run of 5."""
     error = independent(rng, 60, 120, 3)
     error[:, 30] *= np.where(np.arange(60) % 5 == 0, 1.0, 0.1)[:, None]
-    verdict = judge(Record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings(SURE))
+    verdict = judge(make_record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings(SURE))
     assert (verdict.location.steps_above, verdict.location.steps_below) == (0, 1)
     assert verdict.faults == ("scale in some step",)
     assert verdict.status == "heavy-tailed"
@@ -100,5 +103,5 @@ def test_one_axis_in_a_few_steps_is_not_heavy_tailed(rng, ratio):
     """Its NEES spreads as that of one degree of freedom, which is no heavy tail."""
     error = independent(rng, 60, 60, 3)
     error[:, 20:24, 0] *= np.sqrt(ratio)
-    verdict = judge(Record("axis", error, np.tile(np.eye(3), (60, 60, 1, 1))), Settings(SURE))
+    verdict = judge(make_record("axis", error, np.tile(np.eye(3), (60, 60, 1, 1))), Settings(SURE))
     assert verdict.status == "overconfident"

@@ -63,12 +63,12 @@ def read(path, **arrays):
 def test_errors_are_those_put_in(convention, n, tmp_path):
     arrays, e, P = states(convention, n)
     record = cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error=convention)
-    assert_allclose(record.error, e, atol=1e-9)
+    assert_allclose(record.errors.error, e, atol=1e-9)
     nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
-    assert_allclose(record.nees, nees, rtol=1e-9)
-    assert record.axes[:9] == ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")
-    assert record.convention == convention
-    assert any(note.startswith(f"error convention {convention}: ") for note in record.notes)
+    assert_allclose(record.errors.nees, nees, rtol=1e-9)
+    assert record.errors.axes[:9] == ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")
+    assert record.errors.convention == convention
+    assert any(note.startswith(f"error convention {convention}: ") for note in record.origin.notes)
 
 
 def test_the_additive_error_is_the_others_to_first_order(tmp_path):
@@ -97,7 +97,7 @@ def test_the_additive_error_is_the_others_to_first_order(tmp_path):
     small["true_p"][0, 0], small["true_v"][0, 0] = own[:3, 4] + tiny[3:6], own[:3, 3] + tiny[6:]
     for kind, jacobian in J.items():
         record = cs.read(read(tmp_path / "imu.npz", **small, covariances=P[:1, :1]), error=kind)
-        assert_allclose(record.error[0, 0], jacobian @ tiny, rtol=0, atol=1e-8)
+        assert_allclose(record.errors.error[0, 0], jacobian @ tiny, rtol=0, atol=1e-8)
 
 
 def rotation_vector(R):
@@ -114,9 +114,9 @@ def test_another_order_of_the_covariance(tmp_path):
     first = {key: array[0] for key, array in arrays.items()}
     path = read(tmp_path / "imu.npz", **first, covariances=P[0][:, turned][:, :, turned], order=["p", "R", "v"])
     record = cs.read(path, error="left")
-    assert_allclose(record.error[0], e[0][:, turned], atol=1e-9)
-    assert record.axes == ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
-    assert_allclose(record.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0]))
+    assert_allclose(record.errors.error[0], e[0][:, turned], atol=1e-9)
+    assert record.errors.axes == ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")
+    assert_allclose(record.errors.nees[0], np.einsum("ti,ti->t", e[0], np.linalg.solve(P[0], e[0][..., None])[..., 0]))
 
 
 def test_a_state_that_breaks_down_is_a_failure(tmp_path):
@@ -245,10 +245,10 @@ def test_states_in_a_table(kind, form, n, inside):
     arrays, e, P = states(kind, n)
     e, P = e[0][:, PLACES[:n]], P[0][:, PLACES[:n]][:, :, PLACES[:n]]
     record = cs.read(table(arrays, P, form), truth=named(arrays), error=kind)
-    assert_allclose(record.error[0], e, atol=1e-9)
-    assert_allclose(record.nees[0], nees(e, P), rtol=1e-9)
-    assert record.axes == tuple(LABELS[:n])
-    assert record.convention == kind
+    assert_allclose(record.errors.error[0], e, atol=1e-9)
+    assert_allclose(record.errors.nees[0], nees(e, P), rtol=1e-9)
+    assert record.errors.axes == tuple(LABELS[:n])
+    assert record.errors.convention == kind
 
 
 @pytest.mark.parametrize("name, header", [("data.csv", ASL), ("truth.csv", "")])
@@ -258,7 +258,7 @@ def test_the_truth_of_euroc_has_velocity_and_biases(name, header, inside, capsys
     first = table(arrays, P[0], "full")  # the columns have no labels, so that the order is declared
     truth = lines(name, header, [nanoseconds(T), *columns(arrays, true=True)])
     record = cs.read(first, truth=truth, error="left", covariance_order="rotation-translation")
-    assert_allclose(record.nees[0], nees(e[0], P[0]), rtol=1e-9)
+    assert_allclose(record.errors.nees[0], nees(e[0], P[0]), rtol=1e-9)
     _, err = consistency(capsys, "analyse", first, "--truth", truth, "--error", "left")
     assert "error convention left: Log(estimate^-1 truth)" in err
 
@@ -267,9 +267,9 @@ def test_deviations_of_states_are_judged_component_by_component(inside):
     arrays, e, P = states("so3")
     e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
     record = cs.read(table(arrays, P, "deviations"), truth=named(arrays), error="so3")
-    assert_allclose(record.nees[0], (e**2 / np.diagonal(P, axis1=1, axis2=2)).sum(axis=1), rtol=1e-9)
-    assert record.parts == tuple((i,) for i in range(15))
-    assert record.axes == tuple(LABELS)
+    assert_allclose(record.errors.nees[0], (e**2 / np.diagonal(P, axis1=1, axis2=2)).sum(axis=1), rtol=1e-9)
+    assert record.errors.parts == tuple((i,) for i in range(15))
+    assert record.errors.axes == tuple(LABELS)
 
 
 def test_the_true_velocity_between_two_samples(inside):
@@ -286,7 +286,7 @@ def test_the_true_velocity_between_two_samples(inside):
     share = np.arange(STEPS) * (STEPS - 1) / STEPS
     for i, axis in enumerate("xyz"):
         true = np.interp(share, np.arange(STEPS), truth[7 + i])
-        assert_allclose(record.error[0, :, record.axes.index(f"v{axis}")], true - own[7 + i], atol=1e-9)
+        assert_allclose(record.errors.error[0, :, record.errors.axes.index(f"v{axis}")], true - own[7 + i], atol=1e-9)
 
 
 def test_without_a_true_velocity_the_pose_is_judged(inside):
@@ -297,10 +297,10 @@ def test_without_a_true_velocity_the_pose_is_judged(inside):
         less = {key: value for key, value in arrays.items() if keep or key not in ("true_v", "true_bg", "true_ba")}
         less = {key: value for key, value in less.items() if not key.startswith("true_b")}
         record = cs.read(est, truth=named(less), error="so3")
-        assert_allclose(record.nees[0], nees(e[:, : 6 + keep], P[:, : 6 + keep, : 6 + keep]), rtol=1e-9)
-        assert f"truth.csv: holds no {what}, so that those of est.csv are not judged" in record.notes
+        assert_allclose(record.errors.nees[0], nees(e[:, : 6 + keep], P[:, : 6 + keep, : 6 + keep]), rtol=1e-9)
+        assert f"truth.csv: holds no {what}, so that those of est.csv are not judged" in record.origin.notes
     aligned = cs.read(est, truth=named(arrays), error="so3", align="posyaw-all")
-    assert aligned.axes == tuple(LABELS[:6])
+    assert aligned.errors.axes == tuple(LABELS[:6])
 
 
 @pytest.mark.parametrize(
@@ -325,4 +325,4 @@ def test_the_additive_error_is_of_states(inside):
     )
     with pytest.raises(cs.InputError, match="--error additive: for a trajectory in space it is one of so3, so3-body"):
         cs.read(est, truth=named(arrays), error="additive")
-    assert cs.read(est, truth=named(arrays)).axes == tuple(LABELS[:6])
+    assert cs.read(est, truth=named(arrays)).errors.axes == tuple(LABELS[:6])

@@ -12,7 +12,7 @@ import pytest
 from draws import identities, independent
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
 from consistency.referee.diagnostics.words.sentences import reasons
@@ -23,7 +23,7 @@ from consistency.referee.types import Failure
 
 
 def judged(error, **settings):
-    record = Record("f", error, identities(error), axes=("x", "y", "heading")[: error.shape[-1]])
+    record = make_record("f", error, identities(error), axes=("x", "y", "heading")[: error.shape[-1]])
     return judge(record, Settings(**{"false_alarm": 1e-5} | settings))  # type: ignore[arg-type]
 
 
@@ -89,7 +89,7 @@ def test_credibility_and_p_values_are_details(rng):
 def test_pages_leave_out_credibility_indices(rng):
     """Nothing on a page of files says what they are."""
     error = 2.0 * independent(rng, 40, 6, 3)
-    record = Record("f", error, identities(error), axes=("x", "y", "heading"))
+    record = make_record("f", error, identities(error), axes=("x", "y", "heading"))
     document = repr(compose_files([record], {"f": judge(record)}, "f", {}))
     assert "2-sigma coverage" in document
     assert "noncredibility" not in document
@@ -97,7 +97,7 @@ def test_pages_leave_out_credibility_indices(rng):
 
 def test_a_verdict_that_failed_plans_no_runs(rng):
     error = independent(rng, 20, 6, 3)
-    record = Record("f", error, identities(error))
+    record = make_record("f", error, identities(error))
     settings = Settings(1e-5, detect=1.2)
     assert judge(record, settings).reasons[0].endswith("such runs would probably decide")
     failed = judge(replace(record, failures=(Failure("f", 3, 2, "it broke"),)), settings)

@@ -100,7 +100,7 @@ def test_a_window_that_is_left_out_begins_another_run(rng, tmp_path):
     assert len(model.stretches) >= 3
     write_model(model, tmp_path / "out")
     record = cs.read(tmp_path / "out" / "motions.csv", truth=tmp_path / "out" / "truth.csv", relative=1, motions=True)
-    assert np.isfinite(np.asarray(record.nees)).sum() == model.counts["windows"]
+    assert np.isfinite(np.asarray(record.errors.nees)).sum() == model.counts["windows"]
 
 
 def test_motions_without_a_clock_have_no_column_of_it(planar, tmp_path):

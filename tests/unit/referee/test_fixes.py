@@ -113,7 +113,7 @@ def test_a_solution_against_a_solution(inside, capsys):
     for each, C, at in zip(e, P, off, strict=True):
         turn = axes_at(place[0]) @ axes_at(at).T
         nees.append(each @ np.linalg.solve(turn @ C @ turn.T, each))
-    assert_allclose(record.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
+    assert_allclose(record.errors.nees[0], nees, rtol=1e-6)  # places of 6e6 m hold errors of 0.05 m to 1e-8
     _, err = consistency(capsys, "analyse", estimates, "--truth", truth)
     assert (
         "rover.pos: read as a solution of RTKLIB, 15 columns, times of GPS as UTC, 18 leap seconds less; 12 fixed"
@@ -141,7 +141,7 @@ def test_columns_of_a_solution_make_groups(name, inside):
         lines[k] = " ".join(cells)
     rover.write_text("\n".join(lines) + "\n")
     record = cs.read(rover, truth=base, by=name)
-    assert record.by[0].tolist() == values
+    assert record.runs.by[0].tolist() == values
     assert record.groups.names == (f"{name} <= 1", f"{name} > 1")
     with pytest.raises(cs.InputError, match=r"--by q: .*rover\.pos has no such column; there are: Q, ns, sdn, .*ratio"):
         cs.read(rover, truth=base, by="q")
@@ -154,8 +154,10 @@ def test_a_solution_as_the_truth_of_poses(inside):
     d.own[:, :3] = plane(place, place[0]) - (d.true - d.own)[:, :3]
     record = cs.read(tum(d), truth=solution("rtk.pos", place, P))
     e, C = plane(place, place[0]) - d.own[:, :3], d.P[:, :3, :3]
-    assert_allclose(record.nees[0], [each @ np.linalg.solve(M, each) for each, M in zip(e, C, strict=True)], rtol=1e-6)
-    assert any("add --align posyaw-all where est.tum is in another world" in note for note in record.notes)
+    assert_allclose(
+        record.errors.nees[0], [each @ np.linalg.solve(M, each) for each, M in zip(e, C, strict=True)], rtol=1e-6
+    )
+    assert any("add --align posyaw-all where est.tum is in another world" in note for note in record.origin.notes)
 
 
 def test_the_truth_of_a_solution_has_a_covariance(inside):
@@ -167,12 +169,12 @@ def test_the_truth_of_a_solution_has_a_covariance(inside):
     d.own[:, :3] = plane(place, place[0])
     for estimates in (solution("rover.pos", place + np.array([1e-7, 1e-7, 0.01]), P), tum(d)):
         record = cs.read(estimates, truth=truth, truth_covariance="columns")
-        assert_allclose(record.truth_covariance[0], stated, rtol=1e-6, atol=1e-12)
+        assert_allclose(record.truth.covariance[0], stated, rtol=1e-6, atol=1e-12)
         without = cs.read(estimates, truth=truth)
-        assert without.truth_covariance is None
+        assert without.truth.covariance is None
         said = "rtk.pos: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
-        assert said in without.notes
-        assert said not in record.notes
+        assert said in without.origin.notes
+        assert said not in record.origin.notes
 
 
 def test_a_baseline_is_local_already(inside):
@@ -192,8 +194,8 @@ def test_a_baseline_is_local_already(inside):
     truth = lines("truth.txt", "", [EPOCH + 0.25 * np.arange(STEPS), *true.T], " ")
     record = cs.read("enu.pos", truth=truth)
     e = true - own
-    assert_allclose(record.nees[0], [x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)], rtol=1e-9)
-    assert any(note.endswith("12 float") for note in record.notes)
+    assert_allclose(record.errors.nees[0], [x @ np.linalg.solve(C, x) for x, C in zip(e, P, strict=True)], rtol=1e-9)
+    assert any(note.endswith("12 float") for note in record.origin.notes)
 
 
 def centred_solution(path, place, P):
@@ -240,7 +242,7 @@ def test_other_forms_of_a_place(write, corner, inside):
     assert_array_equal(other.t, plain.t)
     record = cs.read("b.pos", truth=solution("truth.pos", place + np.array([1e-7, 2e-7, 0.05]), 1e-6 * P))
     same = cs.read("a.pos", truth="truth.pos")
-    assert_allclose(record.nees, same.nees, rtol=1e-4)
+    assert_allclose(record.errors.nees, same.errors.nees, rtol=1e-4)
 
 
 def test_an_angle_that_is_none(tmp_path):

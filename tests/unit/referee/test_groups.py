@@ -2,16 +2,16 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import consistency
+from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions.planning import in_pieces
 from consistency.referee.diagnostics.questions.scale import equivalence, ratio_interval, scale_test, weighted_of
 from consistency.referee.diagnostics.records.groups import (
@@ -145,7 +145,7 @@ def test_runs_count_by_their_steps_in_a_group():
         rows.append((error**2 / variance, scaled))
     nees, innovations = (np.stack([row[i] for row in rows], axis=1) for i in (0, 1))
     groups = groups_of(column_of("sum", innovations.cumsum(axis=1)), [-5.0, 5.0])
-    verdict = judge(Record("kf", nees=nees, dof=1, groups=groups), Settings(1e-6))  # fails with 1e-6 at most
+    verdict = judge(make_record("kf", nees=nees, dof=1, groups=groups), Settings(1e-6))  # fails with 1e-6 at most
     assert GROUP not in verdict.faults
     middle = np.where(groups.index == 1, nees, np.nan)
     assert np.nanmean(np.nanmean(middle, axis=1)) > 1.02
@@ -242,7 +242,7 @@ def test_heavy_tails_in_a_group_are_called_so():
     few, many = (stats.chi2.ppf((np.arange(count) + 0.5) / count, 3) for count in (40, 240))
     few[-3:] *= 2.5
     groups = groups_of(column_of("w", np.repeat(["few", "many"], [40, 240])[:, None]))
-    verdict = judge(Record("tails", nees=np.r_[few, many][:, None], dof=3, groups=groups), Settings(0.2))
+    verdict = judge(make_record("tails", nees=np.r_[few, many][:, None], dof=3, groups=groups), Settings(0.2))
     assert verdict.faults == (GROUP,)
     assert verdict.status == "heavy-tailed"
 
@@ -276,12 +276,12 @@ def test_standard_deviations_are_judged_by_group_one_by_one():
 def test_groups_go_with_runs_windows_and_pieces():
     error, covariance, column = wrong_in_the_first()
     groups = groups_of(column_of("mode", column))
-    record = Record("mine", error, covariance, nees=np.square(error).sum(-1), dof=2, groups=groups)
+    record = make_record("mine", error, covariance, nees=np.square(error).sum(-1), dof=2, groups=groups)
     assert record.first_runs(3).groups.index.shape == (3, 20)
-    as_runs = replace(record, independent=True).as_runs
+    as_runs = changed(record, independent=True).as_runs
     assert as_runs.groups.index.shape == (800, 1)
     assert as_runs.groups.index[:5, 0].tolist() == [0, 1, 2, 3, 0]
-    log = Record("log", *(array.reshape(1, 800, *array.shape[2:]) for array in (error, covariance)),
+    log = make_record("log", *(array.reshape(1, 800, *array.shape[2:]) for array in (error, covariance)),
                  groups=groups_of(column_of("mode", column.reshape(1, 800))))  # fmt: skip
     assert in_pieces(log, 20).groups.index.shape == (20, 40)
     assert in_pieces(log, 20).groups.index[1, :4].tolist() == [0, 1, 2, 3]
@@ -407,9 +407,9 @@ def test_a_table_beside_the_estimates(table, tmp_path):
     """The last value at or before a step counts; before the first there is none."""
     (tmp_path / "sats.csv").write_text("run,t,sats\n" + "".join(f"{run},0.5,9\n{run},1.2,4\n" for run in range(40)))
     record = cs.read(table, state=["a"], by="sats", by_file=tmp_path / "sats.csv")
-    assert record.by[7, :4].tolist() == pytest.approx([np.nan] * 4, nan_ok=True)
-    assert record.by[7, 4:11].tolist() == [9.0] * 7
-    assert record.by[7, 11:].tolist() == [4.0] * 9
+    assert record.runs.by[7, :4].tolist() == pytest.approx([np.nan] * 4, nan_ok=True)
+    assert record.runs.by[7, 4:11].tolist() == [9.0] * 7
+    assert record.runs.by[7, 11:].tolist() == [4.0] * 9
     (tmp_path / "sites.csv").write_text("run,site\n" + "".join(f"{run},{'ab'[run % 2]}\n" for run in range(40)))
     record = cs.read(table, state=["a"], by="site", by_file=tmp_path / "sites.csv")
     assert record.groups.index[:3, -1].tolist() == [0, 1, 0]
@@ -425,14 +425,14 @@ def test_a_trajectory_with_a_table(tmp_path):
     (tmp_path / "m.csv").write_text("t,n_matches\n" + "".join(f"{k / 10},{k % 7}\n" for k in range(0, 400, 2)))
     files = {"truth": tmp_path / "truth.txt", "covariance": tmp_path / "P.txt", "error": "so3"}
     record = cs.read(tmp_path / "est.txt", **files, by="n_matches", by_file=tmp_path / "m.csv")
-    assert record.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
+    assert record.runs.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
     with pytest.raises(cs.InputError, match="has no columns of its own; --by-file FILE names a table"):
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
     names = "t,x,y,z,qx,qy,qz,qw,n_matches"
     named = np.column_stack([estimate, np.arange(400) % 7])
     np.savetxt(tmp_path / "named.csv", named, delimiter=",", header=names, comments="")
     record = cs.read(tmp_path / "named.csv", **files, by="n_matches")
-    assert record.by[0, :4].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert record.runs.by[0, :4].tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_windows_take_the_value_at_their_beginning(tmp_path):
@@ -446,7 +446,7 @@ def test_windows_take_the_value_at_their_beginning(tmp_path):
     record = cs.read(
         tmp_path / "est.csv", tmp_path / "truth.csv", relative=2, motions=True, windows="independent", by="mode"
     )
-    assert record.by[0, :4].tolist() == [0.0, 2.0, 0.0, 2.0]
+    assert record.runs.by[0, :4].tolist() == [0.0, 2.0, 0.0, 2.0]
     assert record.as_runs.groups.index[:4, 0].tolist() == [0, 1, 0, 1]
 
 

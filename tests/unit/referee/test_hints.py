@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from recorded import read_recordings
+from records import changed
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from consistency.diagnostics import Record
+from consistency.diagnostics import make_record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import composed, matrices, planar_error, spatial_error, vectors, wrap
 from consistency.referee.notebook.read_and_judge import judge, read
@@ -686,7 +687,7 @@ def test_other_ratios_are_no_level(factors, runs, rng):
 
 def test_a_cause_that_is_known_leaves_no_perhaps(rng):
     e, P = sized(rng, [1 / 3.84] * 2)
-    assert judge(Record("est", error=e, covariance=P, causes=("known",))).causes == ("known",)
+    assert judge(changed(make_record("est", error=e, covariance=P), causes=("known",))).causes == ("known",)
 
 
 # --- frames -----------------------------------------------------------------------------------------
@@ -812,8 +813,8 @@ def test_mix_ups_of_motions_are_named(key, mess, said, tmp_path, rng):
     arrays = wheels(rng)
     np.savez(tmp_path / "wheels.npz", **arrays | {key: mess(arrays[key])})  # type: ignore[arg-type]
     record = read(tmp_path / "wheels.npz", relative=20, motions=True)
-    assert_named(record.causes, said)
-    assert set(record.causes) <= set(record.notes)
+    assert_named(record.origin.causes, said)
+    assert set(record.origin.causes) <= set(record.origin.notes)
 
 
 def test_mix_ups_of_poses_with_cross_covariances_are_named(rng):
@@ -856,7 +857,7 @@ def test_one_triangle_of_36_numbers_is_read(root, said, tmp_path, rng):
     np.savetxt(tmp_path / "est.txt", np.column_stack([p.t, p.estimate, M]), fmt="%.15g")
     np.savetxt(tmp_path / "truth.txt", np.column_stack([p.t, p.truth]), fmt="%.15g")
     record = read(tmp_path / "est.txt", tmp_path / "truth.txt")
-    assert_named(record.causes, said)
+    assert_named(record.origin.causes, said)
 
 
 def test_a_matrix_with_two_triangles_that_differ_is_still_refused():
@@ -889,11 +890,11 @@ def test_causes_of_innovations(nis_of, said, optimal, rng):
     """A filter of right errors in 2,400 steps; neither a wrong R nor a gate that rejects 5 % is named."""
     e, v = rng.normal(size=(40, 60, 2)), rng.normal(size=(40, 60, 3))
     P, dof = np.broadcast_to(np.eye(2), (40, 60, 2, 2)), np.full((40, 60), 2.0)
-    record = Record("est", error=e, covariance=P, nis=nis_of(v), nis_dof=dof, optimal_gain=optimal)
+    record = make_record("est", error=e, covariance=P, nis=nis_of(v), nis_dof=dof, optimal_gain=optimal)
     verdict = judge(record)
     assert_named(verdict.causes, said)
     assert set(verdict.causes) <= set(verdict.reasons)
-    wrong = replace(record, error=3.0 * e)
+    wrong = changed(record, error=3.0 * e)
     assert not any("after the update" in cause for cause in judge(wrong).causes)
 
 
@@ -995,9 +996,9 @@ def test_the_hint_is_a_note_of_what_was_read(tmp_path, rng):
     for name, values in (("est", p.estimate), ("truth", p.truth), ("P", p.covariance.reshape(STEPS, 36))):
         np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.t, values]), fmt="%.17g")
     files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
-    wrong = read_recordings(*files, covariance_order="rotation-translation")[0].notes
+    wrong = read_recordings(*files, covariance_order="rotation-translation")[0].origin.notes
     assert any("in the other order (--covariance-order)" in note for note in wrong)
-    assert not any("about right if" in note for note in read_recordings(*files)[0].notes)
+    assert not any("about right if" in note for note in read_recordings(*files)[0].origin.notes)
 
 
 def trials(rng, runs=20, steps=40):
@@ -1042,7 +1043,7 @@ def test_files_that_know_steps_and_no_times_get_hints(change, said, tmp_path, rn
     (table,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
     (archive,) = read_recordings(tmp_path / "est.npz", error="so2")
     for record in (table, archive):
-        hints_given = [note for note in record.notes if "about right if" in note]
+        hints_given = [note for note in record.origin.notes if "about right if" in note]
         assert [note.partition("about right if ")[2] for note in hints_given] == ([] if said is None else [said])
 
 
@@ -1050,7 +1051,7 @@ def test_errors_alone_get_the_hints_of_covariances(tmp_path, rng):
     truth, estimates, P = trials(rng)
     np.savez(tmp_path / "errors.npz", errors=truth - estimates, covariances=np.linalg.inv(P))
     (record,) = read_recordings(tmp_path / "errors.npz")
-    assert any(note.endswith("it is an information matrix; invert it") for note in record.notes)
+    assert any(note.endswith("it is an information matrix; invert it") for note in record.origin.notes)
 
 
 @pytest.mark.parametrize("wrapped", [True, False])
@@ -1067,11 +1068,11 @@ def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped, tmp_path, rng):
     ):
         (record,) = read_recordings(tmp_path / f"{name}.npz")
         said = f"{name}: the error of {axis} is off by 2 pi in {jumps} of 800 steps, as that of an angle; {remedy}"
-        assert [note for note in record.notes if "2 pi" in note] == ([said] if wrapped else [])
+        assert [note for note in record.origin.notes if "2 pi" in note] == ([said] if wrapped else [])
     assert jumps == 0 or wrapped
     assert jumps > 2 or not wrapped
     (judged,) = read_recordings(tmp_path / "poses.npz", error="so2")
-    assert not any("2 pi" in note for note in judged.notes)
+    assert not any("2 pi" in note for note in judged.origin.notes)
 
 
 def test_errors_that_are_far_off_by_themselves_are_no_angle(rng):
@@ -1086,5 +1087,5 @@ def test_steps_are_no_clock(tmp_path, rng):
     write_steps(tmp_path / "truth.csv", truth + along, P)
     write_steps(tmp_path / "late.csv", np.roll(estimates + along, 1, axis=1)[:, 1:], P[:, 1:])
     (record,) = read_recordings(tmp_path / "late.csv", tmp_path / "truth.csv")
-    notes = [note.replace(str(tmp_path), "") for note in record.notes]
+    notes = [note.replace(str(tmp_path), "") for note in record.origin.notes]
     assert not any("offset" in note or "clock" in note for note in notes), notes

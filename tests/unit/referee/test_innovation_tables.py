@@ -113,7 +113,7 @@ def test_the_command_line(capsys):
     ):
         rows.append(consistency(capsys, "monitor", name, *OPTIMAL, *words)[0].split("\n")[1].split()[1:])
         record = cs.read(name, **options)  # type: ignore[arg-type]
-        assert_allclose(record.nis[0], y**2 / 0.09, rtol=1e-9)
+        assert_allclose(record.innovations.nis[0], y**2 / 0.09, rtol=1e-9)
         assert cs.judge(record, optimal_gain=True, false_alarm=1e-5).status in ("consistent", "undecided")
     assert rows[0] == rows[1] == rows[2]
     assert rows[0][:3] == ["300", "300", f"{np.mean(y**2 / 0.09):.3f}"]
@@ -180,6 +180,6 @@ def test_innovations_beside_a_state_are_reported_with_it():
     write("truth.csv", "step,a", steps, steps)
     write("est.csv", "step,a,P_a_a,innovation,innovation_variance", steps, steps + 0.1, ones, 2.0 * ones, ones)
     record = cs.read("est.csv", truth="truth.csv", state=["a"])
-    assert_allclose(record.nis, 4.0)
+    assert_allclose(record.innovations.nis, 4.0)
     write("est.csv", "step,a,P_a_a,NIS,nees,dof", steps, steps + 0.1, ones, ones, ones, 3 * ones)
-    assert cs.read("est.csv", truth="truth.csv", state=["a"]).nis is None
+    assert cs.read("est.csv", truth="truth.csv", state=["a"]).innovations.nis is None

@@ -6,14 +6,14 @@ from numpy.testing import assert_array_equal
 from scipy import stats
 
 from consistency.bench.runs.results_to_records import mean_nees_of_runs, wins
-from consistency.diagnostics import Record
+from consistency.diagnostics import make_record
 from consistency.referee.types import Failure
 
 
 def record_of(nees, failed=(), first=0):
     """Runs ``first``, ``first`` + 1, ... in which the runs named ``failed`` broke down."""
     failures = tuple(Failure("f", run, 2, "NaN") for run in failed)
-    return Record("f", nees=nees, dof=3, failures=failures, runs=np.arange(first, first + len(nees)))
+    return make_record("f", nees=nees, dof=3, failures=failures, runs=np.arange(first, first + len(nees)))
 
 
 def test_run_means_by_hand():

@@ -21,7 +21,7 @@ def test_arrays_are_judged(error, tmp_path):
     assert (verdict.status, verdict.filter, verdict.runs, verdict.steps) == ("consistent", "my.filter", RUNS, STEPS)
     assert verdict.axes.names == ("x", "y")
     assert cs.judge(2.0 * error, identities(error), false_alarm=SURE).status == "overconfident"
-    assert_array_equal(verdict.record.error, error)
+    assert_array_equal(verdict.record.errors.error, error)
     np.savez(tmp_path / "mine.npz", errors=error, covariances=identities(error), axes=["x", "y"])
     read = cs.judge(str(tmp_path / "mine.npz"), false_alarm=SURE)
     assert read.reasons == verdict.reasons

@@ -184,7 +184,7 @@ def test_truth_as_it_is_written(name, inside, capsys):
     write, said = TRUTHS[name]
     truth = write(d)
     record = cs.read(tum(d), truth=truth)
-    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    assert_allclose(record.errors.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
     assert said in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
@@ -202,8 +202,8 @@ def test_the_first_rows_of_euroc_judge_themselves(tmp_path):
     P = np.tile((0.01**2 * np.eye(6)).ravel(), (len(t), 1))
     np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
     record = cs.read(tmp_path / "est.txt", truth=path)
-    assert record.nees.shape == (1, 96)
-    assert_allclose(record.nees, 4.0, atol=2e-4)  # six digits of the quaternions: 1e-6 rad, 1e-4 of a sigma
+    assert record.errors.nees.shape == (1, 96)
+    assert_allclose(record.errors.nees, 4.0, atol=2e-4)  # six digits of the quaternions: 1e-6 rad, 1e-4 of a sigma
 
 
 @pytest.mark.parametrize(
@@ -233,8 +233,8 @@ def test_matrices_of_data_sets_as_they_are(name, count, tmp_path):
     P = np.tile((0.05**2 * np.eye(6)).ravel(), (count, 1))
     np.savetxt(tmp_path / "est.txt", np.column_stack([t, own, P]), fmt="%.17g")
     record = cs.read(tmp_path / "est.txt", truth=path)
-    assert record.nees.shape == (1, count)
-    assert_allclose(record.nees, 4.0, rtol=1e-3)  # matrices of seven digits, two ways to a quaternion
+    assert record.errors.nees.shape == (1, count)
+    assert_allclose(record.errors.nees, 4.0, rtol=1e-3)  # matrices of seven digits, two ways to a quaternion
 
 
 # --- estimates ---------------------------------------------------------------------------------------
@@ -336,7 +336,7 @@ def test_estimates_as_they_are_written(name, inside, capsys):
     path = write(d)
     truth = lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
-    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
+    assert_allclose(record.errors.nees[0], reference(d.own, d.true, d.P), rtol=1e-9, atol=1e-9)
     assert said in consistency(capsys, "analyse", path, "--truth", truth)[1]
 
 
@@ -345,11 +345,11 @@ def test_steps_stand_for_times_where_both_have_none(inside):
     Path("a").mkdir()
     truth = lines("a/truth.txt", "", matrices(d.true), " ")
     own = lines("a/est.txt", "", [*matrices(d.own), *d.P.reshape(STEPS, 36).T], " ")
-    assert_allclose(cs.read(own, truth=truth).nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    assert_allclose(cs.read(own, truth=truth).errors.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
     numbered = lines("a/large.txt", "", [np.arange(STEPS), *matrices(d.true, 4)], " ")
     record = cs.read(own, truth=numbered)
-    assert_allclose(record.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
-    assert any("the first one the number of the step" in note for note in record.notes)
+    assert_allclose(record.errors.nees[0], reference(d.own, d.true, d.P), rtol=1e-9)
+    assert any("the first one the number of the step" in note for note in record.origin.notes)
 
 
 def test_two_blocks_of_cnspy_are_judged_apart(inside):
@@ -364,7 +364,7 @@ def test_two_blocks_of_cnspy_are_judged_apart(inside):
     apart[:, :3, 3:] = apart[:, 3:, :3] = 0.0
 
     position, rotation = read_recordings(Path(path), Path(truth), error="so3")
-    assert_allclose(position.nees[0] + rotation.nees[0], reference(d.own, d.true, apart), rtol=1e-9)
+    assert_allclose(position.errors.nees[0] + rotation.errors.nees[0], reference(d.own, d.true, apart), rtol=1e-9)
 
 
 NAMES = "t,x,y,z,qx,qy,qz,qw"
@@ -401,16 +401,16 @@ def test_deviations_are_judged_axis_by_axis(write, inside):
     d = drive()
     path, truth = write(d), lines("truth.tum", "", [d.t, *d.true.T], " ")
     record = cs.read(path, truth=truth)
-    assert record.parts == ((0,), (1,), (2,), (3,), (4,), (5,))
-    variances = np.diagonal(np.asarray(record.covariance[0]), axis1=1, axis2=2)
-    assert_allclose(record.error[0] ** 2 / variances, alone(d), rtol=1e-9)
-    assert any("standard deviations" in note for note in record.notes)
+    assert record.errors.parts == ((0,), (1,), (2,), (3,), (4,), (5,))
+    variances = np.diagonal(np.asarray(record.errors.covariance[0]), axis1=1, axis2=2)
+    assert_allclose(record.errors.error[0] ** 2 / variances, alone(d), rtol=1e-9)
+    assert any("standard deviations" in note for note in record.origin.notes)
     if path.endswith(".txt"):
         own = lines(
             "turned.txt", "", [d.t, *d.own.T, *np.roll(np.sqrt(np.diagonal(d.P, axis1=1, axis2=2)), 3, axis=1).T], " "
         )
         turned = cs.read(own, truth=truth, covariance_order="rotation-translation")
-        assert_allclose(turned.nees, record.nees, rtol=1e-9)
+        assert_allclose(turned.errors.nees, record.errors.nees, rtol=1e-9)
     assert list(cs.judge(record).parts) == [*SPACE, "roll", "pitch", "yaw"]
     with pytest.raises(cs.InputError, match="--relative needs covariances of whole poses"):
         cs.read(path, truth=truth, relative=2, motions=True)
@@ -424,10 +424,11 @@ def test_deviations_of_a_state(names, inside):
     lines("est.csv", f"step,a,b,{names}", [step, *-e.T, *stated.T])
     lines("truth.csv", "step,a,b", [step, *np.zeros((2, STEPS))])
     record = cs.read("est.csv", truth="truth.csv", state=["a", "b"])
-    assert record.parts == ((0,), (1,))
-    assert_allclose(record.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
+    assert record.errors.parts == ((0,), (1,))
+    assert_allclose(record.errors.nees[0], (e**2 / sigma**2).sum(axis=1), rtol=1e-9)
     assert (
-        "est: standard deviations without cross terms are stated, so each component is judged by itself" in record.notes
+        "est: standard deviations without cross terms are stated, so each component is judged by itself"
+        in record.origin.notes
     )
     lines("est.csv", "step,a,b,sigma_a", [step, *-e.T, sigma[:, 0]])
     with pytest.raises(cs.InputError, match="column 'P_a_a' is missing"):
@@ -528,10 +529,10 @@ def test_a_last_line_that_is_cut_short_is_left_out(file, fields, inside, capsys)
     at = whole.rindex(mark)
     Path(file).write_text(whole[: at + 2 if fields == 1 else at], encoding="utf-8")
     record = cs.read("est.tum", truth=truth)
-    assert record.notes[0].startswith(f"{file}: the last line, ")
-    assert "has no end and is left out" in record.notes[0]
+    assert record.origin.notes[0].startswith(f"{file}: the last line, ")
+    assert "has no end and is left out" in record.origin.notes[0]
     assert not record.failures
-    assert_allclose(record.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
+    assert_allclose(record.errors.nees[0, : STEPS - 1], reference(d.own, d.true, d.P)[:-1], rtol=1e-9)
     assert "has no end and is left out" in consistency(capsys, "analyse", "est.tum", "--truth", truth)[1]
 
 
@@ -558,10 +559,10 @@ def test_a_last_row_of_a_table_that_is_cut_short_is_left_out(case, inside):
         Path(name).write_text(cut(text) if name == file else text, encoding="utf-8")
     est = "est.jsonl" if file == "est.jsonl" else "est.csv"
     record = cs.read(est, truth="truth.csv", state=["a"], max_dt=0.5)
-    assert record.notes[0] == (
+    assert record.origin.notes[0] == (
         f"{file}: the last line, {STEPS + (file != 'est.jsonl')}, has no end and is left out; it seems to be cut short"
     )
-    assert record.nees.shape == (1, STEPS - 1)
+    assert record.errors.nees.shape == (1, STEPS - 1)
     assert not record.failures
     if file == est and "0" not in case.split():  # a line with an end is not cut short, but broken
         Path(est).write_text(cut(texts[est]) + "\n", encoding="utf-8")
@@ -574,8 +575,8 @@ def test_whole_files_without_a_final_newline_are_read_whole(inside):
     lines("truth.csv", NAMES, [d.t, *d.true.T], end="")
     tum(d, end="")
     record = cs.read("est.tum", truth="truth.csv")
-    assert record.nees.shape == (1, STEPS)
-    assert not any("has no end" in note for note in record.notes)
+    assert record.errors.nees.shape == (1, STEPS)
+    assert not any("has no end" in note for note in record.origin.notes)
 
 
 def test_a_last_line_of_nan_is_a_failure(inside):
@@ -631,7 +632,7 @@ def millimetres(d):
 def test_a_mix_up_that_can_be_read_gets_a_hint(write, mend, inside):
     estimates, truth = write(many())
     record = cs.read(estimates, truth=truth)
-    assert [note for note in record.notes if re.search(mend, note)], record.notes
+    assert [note for note in record.origin.notes if re.search(mend, note)], record.notes
 
 
 # --- what odd files are told ----------------------------------------------------------------------------------
@@ -660,8 +661,8 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
     lines("est.csv", f"t,x,y,{heading},{names}", [T, *-e.T, *(np.full(len(T), P[i, j]) for i, j in places)])
     lines("truth.csv", f"t,x,y,{heading}", [T, *np.zeros((3, len(T)))])
     record = cs.read("est.csv", truth="truth.csv")
-    assert_allclose(record.nees[0], np.einsum("ti,ti->t", e, np.linalg.solve(P, e.T).T), rtol=1e-9)
-    assert not record.parts
+    assert_allclose(record.errors.nees[0], np.einsum("ti,ti->t", e, np.linalg.solve(P, e.T).T), rtol=1e-9)
+    assert not record.errors.parts
 
 
 @pytest.mark.parametrize(
@@ -721,5 +722,5 @@ def test_a_solution_of_positions_is_called_so(inside):
     rows = (f"2023/11/14 22:13:2{k}.000 47.4 8.5 488.0 1 0.1 0.1 0.2 0 0 0\n" for k in range(3))
     Path("a.pos").write_text(head + "".join(rows))
     record = cs.read("a.pos", truth="a.pos")
-    assert not any("OpenVINS" in note for note in record.notes)
-    assert any(note.endswith("the default of this layout, positions alone") for note in record.notes)
+    assert not any("OpenVINS" in note for note in record.origin.notes)
+    assert any(note.endswith("the default of this layout, positions alone") for note in record.origin.notes)

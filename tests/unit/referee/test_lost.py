@@ -10,7 +10,6 @@ from scipy import integrate, stats
 
 from consistency.diagnostics import (
     Design,
-    Record,
     Settings,
     follow,
     gate_runs,
@@ -18,6 +17,7 @@ from consistency.diagnostics import (
     look,
     lost_bound,
     lost_runs,
+    make_record,
     pilot_plan,
 )
 from consistency.referee.diagnostics.questions.tails import lost_evidence, lost_of
@@ -31,7 +31,7 @@ SURE = 1e-5
 
 
 def verdict_on(nees, failures=(), **settings):
-    return judge(Record("f", nees=nees, dof=3, failures=failures), Settings(**settings))
+    return judge(make_record("f", nees=nees, dof=3, failures=failures), Settings(**settings))
 
 
 def right(runs, steps=4):
@@ -148,15 +148,17 @@ def test_a_lost_run_takes_more_runs():
 def test_failed_runs_are_lost_and_runs_without_a_value_are_none(rng):
     nees = right(60)
     nees[3], nees[5] = np.nan, np.nan
-    evidence = Record("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
+    evidence = make_record("f", nees=nees, dof=3, failures=(Failure("f", 13, 2, "broke"),), runs=np.arange(60) + 10)
     lost = lost_of(evidence, nees, 3, Settings())
     assert (lost.count, lost.runs) == (1, 59)
-    assert lost_of(Record("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
+    assert (
+        lost_of(make_record("f", nees=np.full((2, 3), np.nan), dof=3), np.full((2, 3), np.nan), 3, Settings()) is None
+    )
 
 
 def test_innovations_alone_show_no_share(rng):
     nis = {"nis": rng.chisquare(2, (200, 30)), "nis_dof": np.full((200, 30), 2)}
-    verdict = judge(Record("f", **nis, optimal_gain=True), Settings(SURE, lost=0.05))
+    verdict = judge(make_record("f", **nis, optimal_gain=True), Settings(SURE, lost=0.05))
     assert verdict.status == "undecided"
     assert "cannot show" in verdict.reasons[0]
 
@@ -180,13 +182,13 @@ def test_the_bet_against_a_share():
 
 def test_until_decided_goes_on_until_the_share_is_excluded():
     nees = right(400)
-    free, runs = follow(Design(3, max_runs=400), lambda n: Record("f", nees=nees[:n], dof=3))
-    asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: Record("f", nees=nees[:n], dof=3))
+    free, runs = follow(Design(3, max_runs=400), lambda n: make_record("f", nees=nees[:n], dof=3))
+    asked, more = follow(Design(3, max_runs=400, lost=0.05), lambda n: make_record("f", nees=nees[:n], dof=3))
     assert (free.status, asked.status) == ("consistent", "consistent")
     assert runs < more == 96
     assert asked.lost.upper <= 0.05
     assert asked.reasons[0].count("lost runs") == 1
-    early = look(Design(3, lost=0.05), Record("f", nees=nees[:48], dof=3), 0.1)
+    early = look(Design(3, lost=0.05), make_record("f", nees=nees[:48], dof=3), 0.1)
     assert early.lost.upper > 0.05
     assert early.lost.bound == pytest.approx(float(lost_bound(3, 0.05 / (48 * 49))))
     needed = early.lost.needed

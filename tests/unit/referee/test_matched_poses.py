@@ -76,11 +76,11 @@ def test_only_what_is_matched_and_stated_is_judged(rng):
         p, stated=np.arange(40) != 7, covariance=np.where((np.arange(40) != 7)[:, None, None], p.covariance, 1e9)
     )
     (record,) = records_of(estimator_of(p), Reading())
-    assert record.error.shape == (1, 36, 3)
-    assert np.nanmax(record.covariance) < 1.0
+    assert record.errors.error.shape == (1, 36, 3)
+    assert np.nanmax(record.errors.covariance) < 1.0
     assert (
         "est: 4 of 40 estimates have no truth or no covariance within 0.01 s (--max-dt) and are left out"
-        in record.notes
+        in record.origin.notes
     )
     with pytest.raises(InputError, match="no estimate has both a truth and a covariance"):
         records_of(estimator_of(replace(p, stated=np.zeros(40, bool))), Reading())

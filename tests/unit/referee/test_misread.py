@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions.whiteness import outliers_of
 from consistency.referee.gating.checked_input import record_of_checked
 from consistency.referee.readers.axes_and_units import require_radians
@@ -65,7 +65,7 @@ def test_masks_of_innovations(rng):
     with pytest.raises(cs.InputError, match=r"innovations, run 1, step 6: 1 of 2 numbers are masked"):
         record_of_checked("f", innovations=np.ma.array(v, mask=partly(v.shape, 1, 5, 0)), **given)
     given["innovation_covariances"] = np.ma.array(S, mask=partly(S.shape, 1, 5))
-    assert np.argwhere(record_of_checked("f", innovations=v, **given).nis_dof == 0).tolist() == [[1, 5]]
+    assert np.argwhere(record_of_checked("f", innovations=v, **given).innovations.nis_dof == 0).tolist() == [[1, 5]]
     given["innovation_covariances"] = np.ma.array(S, mask=partly(S.shape, 1, 5, 0))
     with pytest.raises(cs.InputError, match=r"innovation_covariances, run 1, step 6: 2 of 4"):
         record_of_checked("f", innovations=v, **given)
@@ -90,7 +90,7 @@ def test_a_masked_nis_is_nothing_to_the_monitor():
 
 def test_a_record_keeps_no_mask():
     with pytest.raises(cs.InputError, match=r"nees is a masked array.*nees.filled"):
-        Record("f", nees=np.ma.array(np.ones((3, 4)), mask=partly((3, 4), 1, 1)), dof=2)
+        make_record("f", nees=np.ma.array(np.ones((3, 4)), mask=partly((3, 4), 1, 1)), dof=2)
 
 
 # --- planar robots in 6 x 6 form ---------------------------------------------------------------------
@@ -127,11 +127,11 @@ def test_what_a_planar_robot_does_not_estimate_is_left_out(dummies, suffix, tmp_
     verdict = cs.judge(record, false_alarm=SURE)
     assert (verdict.faults, verdict.failures, verdict.axes.names) == ((), (), ("x", "y", "yaw"))
     same = cs.read(est, truth=truth, axes=["x", "y", "yaw"])
-    assert_array_equal(record.covariance, same.covariance)
-    assert any("z, roll, pitch are not estimated and left out" in note for note in record.notes)
-    assert not any("left out" in note for note in same.notes)
+    assert_array_equal(record.errors.covariance, same.errors.covariance)
+    assert any("z, roll, pitch are not estimated and left out" in note for note in record.origin.notes)
+    assert not any("left out" in note for note in same.origin.notes)
     asked = cs.read(est, truth=truth, axes=["x", "y", "z", "roll", "pitch", "yaw"])
-    assert asked.covariance.shape[-1] == 6
+    assert asked.errors.covariance.shape[-1] == 6
 
 
 def moved(est, truth, change):
@@ -166,12 +166,12 @@ def test_what_never_changes_is_left_out_though_it_is_off(case, dummy, tmp_path):
     est, truth = planar(tmp_path, (dummy,) * 3)
     moved(est, truth, CONSTANT[case])
     record = cs.read(est, truth=truth)
-    assert record.axes == ("x", "y", "yaw")
-    [note] = [note for note in record.notes if "not estimated" in note]
+    assert record.errors.axes == ("x", "y", "yaw")
+    [note] = [note for note in record.origin.notes if "not estimated" in note]
     assert "z, roll, pitch are not estimated and left out, as by --axes x,y,yaw" in note
-    assert_array_equal(record.nees, cs.read(est, truth=truth, axes=["x", "y", "yaw"]).nees)
+    assert_array_equal(record.errors.nees, cs.read(est, truth=truth, axes=["x", "y", "yaw"]).errors.nees)
     if dummy:
-        assert cs.read(est, truth=truth, axes=["x", "z", "yaw"]).axes == ("x", "z", "yaw")
+        assert cs.read(est, truth=truth, axes=["x", "z", "yaw"]).errors.axes == ("x", "z", "yaw")
 
 
 @pytest.mark.parametrize(
@@ -182,8 +182,8 @@ def test_a_height_in_tilted_axes_is_not_left_out(convention, roll, axes, tmp_pat
     est, truth = planar(tmp_path, (1e-6,) * 3)
     moved(est, truth, lambda t, own, true: (tilted(own, roll * ONE, 0.0 * ONE), true))
     record = cs.read(est, truth=truth, error=convention)
-    assert len(record.axes) == axes
-    assert any("not estimated and left out, as by" in note for note in record.notes)
+    assert len(record.errors.axes) == axes
+    assert any("not estimated and left out, as by" in note for note in record.origin.notes)
 
 
 MOVES = {  # and which components are still left out
@@ -204,8 +204,8 @@ def test_what_moves_in_one_of_both_is_judged(case, tmp_path):
     change, left = MOVES[case]
     moved(est, truth, change)
     record = cs.read(est, truth=truth)
-    assert len(record.axes) == 6 - left
-    named = [note for note in record.notes if "never change in the estimates" in note]
+    assert len(record.errors.axes) == 6 - left
+    named = [note for note in record.origin.notes if "never change in the estimates" in note]
     assert bool(named) == ("of the truth" in case)
     assert all("--axes x,y" in note for note in named)
 
@@ -218,15 +218,17 @@ def test_a_variance_that_changes_is_of_an_estimate(tmp_path):
         rows[:, 3] += 0.5
         np.savetxt(path, rows)
     record = cs.read(est, truth=truth)
-    assert record.axes == ("x", "y", "z", "yaw")
-    assert any("z never change in the estimates" in note and "add --axes x,y,yaw" in note for note in record.notes)
+    assert record.errors.axes == ("x", "y", "z", "yaw")
+    assert any(
+        "z never change in the estimates" in note and "add --axes x,y,yaw" in note for note in record.origin.notes
+    )
 
 
 def test_a_robot_that_stands_still_shows_nothing(tmp_path):
     """Every component of repeated fixes of one place never changes, and each has an error."""
     est, truth = planar(tmp_path, (1.0, 1.0, 1.0))
     moved(est, truth, lambda t, own, true: (own[:1] + 0.1 * UP, true[:1]))
-    assert len(cs.read(est, truth=truth).axes) > 3
+    assert len(cs.read(est, truth=truth).errors.axes) > 3
 
 
 def test_only_a_constant_that_is_never_wrong_is_left_out(rng):
@@ -249,7 +251,7 @@ def test_a_variance_in_the_wrong_row(variances, remedy, tmp_path):
         rows[:, 8:] = np.diag([0.01, 0.01, *variances]).ravel()
         np.savetxt(path, rows)
     if not remedy:
-        assert cs.read(est, truth=truth).axes == ("x", "y", "yaw")
+        assert cs.read(est, truth=truth).errors.axes == ("x", "y", "yaw")
         return
     with pytest.raises(cs.InputError, match=remedy):
         cs.read(est, truth=truth)
@@ -330,11 +332,11 @@ def test_errors_that_jump_by_360(rng):
     error = 2.0 * rng.normal(size=(20, 10, 2))
     error[:4, 3, 1] += 360.0
     record = cs.judge(error, 4.0 * identities(2, 20, 10), axes=["x", "heading"]).record
-    assert [note for note in record.notes if "360" in note] == [
+    assert [note for note in record.origin.notes if "360" in note] == [
         "arrays: the error of heading is off by 360 in 4 of 200 steps, as that of an angle; wrap it to [-180, 180]"
     ]
     error[:4, 3, 1] -= 180.0
-    assert not cs.judge(error, 4.0 * identities(2, 20, 10), axes=["x", "heading"]).record.notes
+    assert not cs.judge(error, 4.0 * identities(2, 20, 10), axes=["x", "heading"]).record.origin.notes
 
 
 # --- orientations that are none ----------------------------------------------------------------------
@@ -392,10 +394,10 @@ def test_positions_with_a_placeholder_are_positions(tmp_path):
         np.savetxt(path, rows)
         np.savetxt(bare / path.name, rows[:, :4])
     record, same = (cs.read(est, truth=each, lever_arm=[0.1, 0, 0]) for each in (truth, bare))
-    assert_allclose(record.error, same.error)
-    assert record.axes == ("x", "y", "z")
-    assert any("the truth has the same orientation in every row" in note for note in record.notes)
-    assert cs.read(est, truth=truth, axes=["x", "yaw"]).axes == ("x", "yaw")
+    assert_allclose(record.errors.error, same.errors.error)
+    assert record.errors.axes == ("x", "y", "z")
+    assert any("the truth has the same orientation in every row" in note for note in record.origin.notes)
+    assert cs.read(est, truth=truth, axes=["x", "yaw"]).errors.axes == ("x", "yaw")
 
 
 # --- the order of blocks -----------------------------------------------------------------------------
@@ -425,12 +427,12 @@ def test_blocks_in_any_order(order, tmp_path):
     read = {"truth": truth, "error": "so3", "axes": [*AXES, *REST][: 3 * len(order.split(","))]}
     record = cs.read(est, covariance_order=order, **read)
     n = 3 * len(order.split(","))
-    assert_array_equal(np.diagonal(record.covariance[0, 0]), 1.0 + np.arange(n))
+    assert_array_equal(np.diagonal(record.errors.covariance[0, 0]), 1.0 + np.arange(n))
     assert f"{est}: the covariance is read in the order {order.replace(',', ', ')}; --covariance-order" in " ".join(
-        record.notes
+        record.origin.notes
     )
     for columns in (None, {"P*": "cov*"}):
-        taken = " ".join(cs.read(est, columns=columns, **read).notes)
+        taken = " ".join(cs.read(est, columns=columns, **read).origin.notes)
         assert f"is read in the order {', '.join(['p', 'R', 'v', 'bg', 'ba'][: n // 3])};" in taken
 
 
@@ -441,8 +443,8 @@ def test_named_entries_have_no_order(tmp_path):
     names = ",".join([*rows[0].split(",")[:11], *(f"P_{a}_{b}" for a in labels for b in labels)])
     est.write_text("\n".join([names, *rows[1:]]))
     record = cs.read(est, truth=truth, error="so3", axes=labels)
-    assert record.covariance.shape[-1] == 9
-    assert not any("in the order" in note for note in record.notes)
+    assert record.errors.covariance.shape[-1] == 9
+    assert not any("in the order" in note for note in record.origin.notes)
 
 
 @pytest.mark.parametrize("order, said", [

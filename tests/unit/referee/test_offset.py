@@ -312,8 +312,8 @@ def test_tables_are_read_with_an_offset(tables):
     files = tables / "est.csv", tables / "truth.csv"
     for option, right in ((None, False), (0.1, True), ("estimate", True), (-0.1, False)):
         [record] = read_recordings(*files, time_offset=option)
-        assert (2.5 < np.nanmean(record.nees) < 3.5) == right, option
-    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+        assert (2.5 < np.nanmean(record.errors.nees) < 3.5) == right, option
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].origin.notes)
     assert cs.judge(cs.read(*files, time_offset=0.1)).status != "overconfident"
 
 
@@ -332,10 +332,10 @@ def test_trajectories_are_read_with_an_offset(tmp_path, rng):
         P = np.diag([*SIGMA[:2] ** 2, 1e-4, 1e-4, 1e-4, SIGMA[2] ** 2]).ravel()
         np.savetxt(tmp_path / "P" / f"{number}.txt", np.column_stack([run.t, np.tile(P, (len(run.t), 1))]))
     files = tmp_path / "est", tmp_path / "truth", tmp_path / "P"
-    early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].nees) for o in (None, "estimate"))  # type: ignore[arg-type]
+    early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].errors.nees) for o in (None, "estimate"))  # type: ignore[arg-type]
     assert early > 6.8
     assert 5.0 < right < 6.8
-    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].notes)
+    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].origin.notes)
 
 
 def test_what_has_truth_is_judged_at_every_offset(rng):

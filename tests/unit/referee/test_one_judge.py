@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 from draws import identities, independent
 from numpy.testing import assert_allclose, assert_array_equal
+from records import changed
 
 import consistency as cs
-from consistency.diagnostics import Design, MapRecord, Record, Rejections, Settings, Verdict, follow, judge, look
+from consistency.diagnostics import (
+    Design,
+    MapRecord,
+    Rejections,
+    Settings,
+    Verdict,
+    follow,
+    judge,
+    look,
+    make_record,
+)
 from consistency.referee.diagnostics.judging.error_parts import _sum_of_correlations
 from consistency.referee.diagnostics.questions.maps import last_nees
 from consistency.referee.diagnostics.questions.sample import sample_of
@@ -32,7 +43,7 @@ RUNS = 24
 def record(scale=1.0, **more):
     error = scale * independent(np.random.default_rng(5), RUNS, 4, 3)
     nees = np.square(error).sum(axis=-1)
-    return Record("f", error, identities(error), nees, axes=("x", "y", "heading"), **more)
+    return make_record("f", error, identities(error), nees, axes=("x", "y", "heading"), **more)
 
 
 def map_of(runs):
@@ -42,7 +53,7 @@ def map_of(runs):
 
     def landmarks(last):
         assert last.shape == (runs,)
-        return Record("map", nees=np.tile([3.0, 6.0], (runs, 1)), dof=3, landmarks=np.array([7, 9]))
+        return changed(make_record("map", nees=np.tile([3.0, 6.0], (runs, 1)), dof=3), landmarks=np.array([7, 9]))
 
     return MapRecord(run, nees, 3, landmarks)
 
@@ -53,7 +64,7 @@ def whole_record():
     counts = (np.full(RUNS, n) for n in (10, 4, 3, 2))
     return record(
         convention="left", align="", caption="as fitted", causes=("a probable mix-up",), notes=("a note",),
-        world=Record("f", 3.0 * error, identities(error)), map=lambda: map_of(RUNS),
+        world=make_record("f", 3.0 * error, identities(error)), map=lambda: map_of(RUNS),
         rejections=Rejections(np.arange(RUNS), *counts),
     )  # fmt: skip
 
@@ -87,7 +98,7 @@ def test_the_doors_to_the_judge_say_the_same():
     """Of a record, of its arrays, of a sequence of records."""
     given = record(2.0)
     verdicts = [judge(given), cs.judge(given), cs.analyse([given])["f"]]
-    verdicts.append(cs.judge(given.error, given.covariance, axes=given.axes, name="f"))
+    verdicts.append(cs.judge(given.errors.error, given.errors.covariance, axes=given.errors.axes, name="f"))
     for verdict in verdicts:
         assert verdict.status == "overconfident"
         assert verdict.reasons == verdicts[0].reasons
@@ -104,7 +115,7 @@ def test_a_look_has_what_stands_beside_the_errors_of_its_runs():
     assert verdict.map.verdict is None, "a look has the scores of the maps alone"
     assert verdict.world.convention is None
     assert verdict.world.notes == ()
-    errors = replace(given.in_world, map=None, rejections=None)
+    errors = changed(given.in_world, map=None, rejections=None)
     assert verdict.world.answers == follow(Design(3), errors.first_runs, 12)[0].answers
     assert verdict.world.answers != judge(errors.first_runs(12)).answers, "a look costs a part of the rate"
 
@@ -123,10 +134,10 @@ def test_a_design_judges_by_the_look_that_decides():
 @pytest.mark.parametrize("parts", [(), ((0,), (1,), (2,))])
 def test_a_record_that_shows_nothing_is_undecided(parts):
     """Whether its errors are right or not, whole or each component by itself; a failure is one nevertheless."""
-    wrong = judge(replace(record(3.0, unshown="pieces are too few"), parts=parts))
+    wrong = judge(changed(record(3.0, unshown="pieces are too few"), parts=parts))
     assert (wrong.status, wrong.faults) == ("undecided", ())
-    given = replace(record(unshown="pieces are too few"), parts=parts)
-    assert judge(replace(given, unshown=""), Settings(detect=1e3)).status == "consistent"
+    given = changed(record(unshown="pieces are too few"), parts=parts)
+    assert judge(changed(given, unshown=""), Settings(detect=1e3)).status == "consistent"
     verdict = judge(given, Settings(detect=1e3))
     assert (verdict.status, verdict.faults, verdict.unshown) == ("undecided", (), "pieces are too few")
     ratio = f"the covariance ratio would be {ratio_text(verdict.scale.inflation)} if they are, reported and not judged"
@@ -151,7 +162,7 @@ def test_numbers_of_a_map_and_of_parts_stand_beside_the_others():
 
 def test_a_centred_sample_keeps_what_it_knows():
     given = record()
-    sample = sample_of(replace(given, nees=None), Settings())
+    sample = sample_of(changed(given, nees=None), Settings())
     names, components = sample.names, dict(sample.components)
     centred = sample.centred()
     assert (centred.names, dict(centred.components)) == (names, components)
@@ -185,8 +196,8 @@ def test_the_smallest_p_value_of_steps_counts_their_number():
 
 def test_the_last_nees_of_each_run():
     nees = np.array([[1.0, 2.0, np.nan], [np.nan, np.nan, np.nan], [3.0, np.nan, 4.0]])
-    assert_array_equal(last_nees(Record("f", nees=nees, dof=3)), [2.0, np.nan, 4.0])
-    assert last_nees(replace(record(), nees=None)) is None
+    assert_array_equal(last_nees(make_record("f", nees=nees, dof=3)), [2.0, np.nan, 4.0])
+    assert last_nees(changed(record(), nees=None)) is None
 
 
 # --- arrays -------------------------------------------------------------------------------------------------

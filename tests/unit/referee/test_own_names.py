@@ -79,7 +79,7 @@ def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
     enu, ned = table(tmp_path / "enu.csv", names, true), table(tmp_path / "ned.csv", names, turned(true))
     plain = with_covariance(tmp_path / "own.csv", own, P)
     down = with_covariance(tmp_path / "down.csv", turned(own), carried(P, convention))
-    expected = cs.read(plain, enu, error=convention).nees
+    expected = cs.read(plain, enu, error=convention).errors.nees
     assert np.isfinite(expected).all()
     axes = {"world": "ned", "body_axes": "frd"}
     of_truth = {f"truth_{name}": value for name, value in axes.items()}
@@ -90,10 +90,11 @@ def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
         cs.read(down, ned, error=convention),
     ]
     for record in found:
-        assert_allclose(record.nees, expected, rtol=1e-6)
-    assert np.abs(cs.read(down, enu, error=convention).nees / expected - 1.0).max() > 0.01
+        assert_allclose(record.errors.nees, expected, rtol=1e-6)
+    assert np.abs(cs.read(down, enu, error=convention).errors.nees / expected - 1.0).max() > 0.01
     assert any(
-        "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in n for n in found[0].notes
+        "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in n
+        for n in found[0].origin.notes
     )
 
 
@@ -103,7 +104,7 @@ def test_the_additive_error_is_taken_in_the_axes_of_the_estimates(tmp_path):
     down = with_covariance(tmp_path / "down.csv", turned(own), P)
     enu, ned = table(tmp_path / "enu.csv", names, true), table(tmp_path / "ned.csv", names, turned(true))
     record = cs.read(down, enu, error="additive", world="ned", body_axes="frd")
-    assert_allclose(record.nees, cs.read(down, ned, error="additive").nees, rtol=1e-6)
+    assert_allclose(record.errors.nees, cs.read(down, ned, error="additive").errors.nees, rtol=1e-6)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -118,7 +119,7 @@ def test_the_covariance_of_the_truth_is_turned_with_it(convention, tmp_path):
     given = {"error": convention, "truth_covariance": "columns", "truth_errors": "independent"}
     expected = cs.read(plain, enu, **given)
     record = cs.read(plain, ned, **given, truth_world="ned", truth_body_axes="frd")
-    assert_allclose(record.truth_covariance, expected.truth_covariance, rtol=1e-6, atol=1e-9)
+    assert_allclose(record.truth.covariance, expected.truth.covariance, rtol=1e-6, atol=1e-9)
 
 
 PLANE = ["t", "x", "y", "heading", "P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"]
@@ -140,9 +141,9 @@ def test_poses_in_the_plane(convention, tmp_path):
     plain = table(tmp_path / "own.csv", PLANE, t, own, P[:, i, j])
     ned = table(tmp_path / "down.csv", PLANE, t, down(own), (T @ P @ T)[:, i, j])
     truth, truth_down = (table(tmp_path / f"{k}.csv", PLANE[:4], t, v) for k, v in (("t", true), ("td", down(true))))
-    expected = cs.read(plain, truth, error=convention).nees
-    assert_allclose(cs.read(ned, truth, error=convention, world="ned").nees, expected, rtol=1e-6)
-    assert_allclose(cs.read(plain, truth_down, error=convention, truth_world="ned").nees, expected, rtol=1e-6)
+    expected = cs.read(plain, truth, error=convention).errors.nees
+    assert_allclose(cs.read(ned, truth, error=convention, world="ned").errors.nees, expected, rtol=1e-6)
+    assert_allclose(cs.read(plain, truth_down, error=convention, truth_world="ned").errors.nees, expected, rtol=1e-6)
 
 
 def test_a_truth_of_positions(tmp_path):
@@ -152,7 +153,7 @@ def test_a_truth_of_positions(tmp_path):
     points = table(tmp_path / "points.csv", POSE[:4], true[:, :4])
     expected = cs.read(plain, points, error="left", lever_arm=[0.5, 0.2, -0.1])
     record = cs.read(down, points, error="left", lever_arm=[0.5, -0.2, 0.1], world="ned", body_axes="frd")
-    assert_allclose(record.nees, expected.nees, rtol=1e-6)
+    assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -205,8 +206,8 @@ def test_columns_by_names_of_the_users_own(tmp_path, capsys):
     columns = dict(pair.split("=") for pair in f"t=time_us,{NAMES}".split(","))
     of_truth = dict(pair.split("=") for pair in f"t=time_us,{TRUE_NAMES}".split(","))
     record = cs.read(mine, other, error="so3", columns=columns, truth_columns=of_truth)
-    assert_allclose(record.nees, expected.nees, rtol=1e-9)
-    assert_allclose(record.t, expected.t)
+    assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
+    assert_allclose(record.runs.t, expected.runs.t)
     shown, _ = consistency(
         capsys, "analyse", mine, "--truth", other, "--error", "so3", "--columns", f"t=time_us,{NAMES}",
         "--truth-columns", f"t=time_us,{TRUE_NAMES}", "--json",
@@ -224,10 +225,10 @@ def test_a_folder_of_tables_is_read_as_runs(tmp_path):
         table(tmp_path / "est" / f"{run}.csv", names, t, rng.normal(size=(STEPS, 3)), stated)
         table(tmp_path / "truth" / f"{run}.csv", PLANE[:4], t, rng.normal(size=(STEPS, 3)))
     record = cs.read(tmp_path / "est", tmp_path / "truth", columns=columns)
-    assert (record.name, record.runs.tolist()) == ("est", [0, 1, 2])
+    assert (record.name, record.runs.numbers.tolist()) == ("est", [0, 1, 2])
     for run in range(3):
         one = cs.read(tmp_path / "est" / f"{run}.csv", tmp_path / "truth" / f"{run}.csv", columns=columns)
-        assert_allclose(record.nees[run], one.nees[0], rtol=1e-12)  # type: ignore[index]
+        assert_allclose(record.errors.nees[run], one.errors.nees[0], rtol=1e-12)  # type: ignore[index]
     (tmp_path / "truth" / "2.csv").unlink()
     with pytest.raises(cs.InputError, match=r"--truth .*truth: holds no table '2' for .*2\.csv"):
         cs.read(tmp_path / "est", tmp_path / "truth", columns=columns)
@@ -242,8 +243,8 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
         table(tmp_path / "est" / f"{run}.csv", mine, own, P.reshape(STEPS, -1))
         table(tmp_path / "truth" / f"{run}.csv", POSE, true)
     record = cs.read(tmp_path / "est", tmp_path / "truth", columns=names)
-    assert record.nees is not None
-    assert record.nees.shape == (2, STEPS)
+    assert record.errors.nees is not None
+    assert record.errors.nees.shape == (2, STEPS)
     for missing, word in (("x", "pn"), ("t", "clock")):  # of the truth: a file with names is not read as one without
         own = table(
             tmp_path / f"{word}.csv", [word if name == missing else name for name in [*POSE, "vn"]], true, P[:, 0, 0]
@@ -275,8 +276,8 @@ def test_one_column_states_two_deviations(tmp_path, suffix):
         assert set(sheet.data) == {"timestamp_us", "x", "y", "sigma_x", "sigma_y"}
         return
     record = cs.read(*files, state=["x", "y"], columns=given)
-    assert_allclose(record.covariance[0], sigma[:, None, None] ** 2 * np.eye(2), rtol=1e-6)
-    assert_allclose(record.error[0], true - own, atol=1e-9)
+    assert_allclose(record.errors.covariance[0], sigma[:, None, None] ** 2 * np.eye(2), rtol=1e-6)
+    assert_allclose(record.errors.error[0], true - own, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from draws import independent
 from numpy.testing import assert_allclose
+from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, gate_runs, judge, ratio_interval
+from consistency.diagnostics import Settings, gate_runs, judge, make_record, ratio_interval
 from consistency.referee.diagnostics.records.record import each_alone
 from consistency.referee.diagnostics.records.whitening import diagonal
 from consistency.referee.gating.session import RunningTest, needed_at, watching
@@ -104,23 +105,23 @@ def test_parts_of_several_components_use_their_cross_terms(rng):
     """x and y with their correlation, z by itself."""
     error = correlated(rng)
     P = np.broadcast_to(np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]]), (60, 12, 3, 3))
-    record = Record("f", error, P, axes=("x", "y", "z"), parts=((0, 1), (2,)))
+    record = make_record("f", error, P, axes=("x", "y", "z"), parts=((0, 1), (2,)))
     verdict = judge(record, Settings(SURE))
     assert verdict.status == "consistent"
     assert [*verdict.parts] == ["x, y", "z"]
     P = np.where(np.eye(3, dtype=bool), P, -P)
-    assert "x, y: correlation of the wrong sign" in judge(replace(record, covariance=P), Settings(SURE)).reasons[0]
+    assert "x, y: correlation of the wrong sign" in judge(changed(record, covariance=P), Settings(SURE)).reasons[0]
 
 
 def test_innovations_share_the_rate(rng):
     nis = rng.chisquare(2, (60, 12))
     record = each_alone(
-        Record("f", correlated(rng), diagonal(np.ones((60, 12, 3))), nis=nis, nis_dof=np.full((60, 12), 2))
+        make_record("f", correlated(rng), diagonal(np.ones((60, 12, 3))), nis=nis, nis_dof=np.full((60, 12), 2))
     )
     assert [*judge(record, Settings(SURE)).parts] == ["axis 0", "axis 1", "axis 2"]
-    judged = replace(record, optimal_gain=True)
+    judged = changed(record, optimal_gain=True)
     assert [*judge(judged, Settings(SURE)).parts][-1] == "innovations"
-    verdict = judge(replace(judged, nis=3.0 * nis), Settings(SURE))
+    verdict = judge(changed(judged, nis=3.0 * nis), Settings(SURE))
     assert verdict.status == "overconfident"
     assert verdict.faults == ("innovation scale of innovations",)
 
@@ -141,7 +142,7 @@ def test_misuse_is_refused(rng):
     with pytest.raises(cs.InputError, match="--truth-covariance needs covariances"):
         cs.judge(error, deviations=np.ones(error.shape), truth_covariances=diagonal(np.ones(error.shape)))
     with pytest.raises(ValueError, match="has no errors"):
-        each_alone(Record("f", nees=np.ones((3, 2)), dof=2))
+        each_alone(make_record("f", nees=np.ones((3, 2)), dof=2))
 
 
 # --- gates -----------------------------------------------------------------------------------------
@@ -192,6 +193,6 @@ def test_two_estimators_that_state_deviations(rng):
 def test_the_interval_of_the_whole_allows_for_parts_whose_errors_are_the_same(rng, parts, least):
     """With fewer than 20 runs: the mean NEES then has the degrees of freedom of the smallest part."""
     error = independent(rng, 8, 5, 4)
-    verdict = judge(Record("f", error, diagonal(np.ones(error.shape)), dof=4, axes=tuple("wxyz"), parts=parts))
+    verdict = judge(make_record("f", error, diagonal(np.ones(error.shape)), dof=4, axes=tuple("wxyz"), parts=parts))
     expected = ratio_interval(np.square(error).mean(axis=(1, 2)), least)
     assert_allclose(verdict.scale.inflation, expected)

@@ -104,8 +104,8 @@ def test_the_point_of_a_prism(
     J = np.concatenate([np.tile(np.eye(3), (STEPS, 1, 1)), [-skew(each @ ARM) for each in R]], axis=2)
     P = J @ d.P @ np.swapaxes(J, 1, 2)
     nees = [each @ np.linalg.solve(C, each) for each, C in zip(e, P, strict=True)]
-    assert_allclose(record.nees[0], nees, rtol=1e-9)
-    assert record.axes == ("x", "y", "z")
+    assert_allclose(record.errors.nees[0], nees, rtol=1e-9)
+    assert record.errors.axes == ("x", "y", "z")
     _, err = consistency(capsys, "analyse", "est.tum", "--truth", truth, "--lever-arm", "0.3,-0.2,0.5")
     assert "the truth has no orientation, so that the position alone is judged, of the point (0.3, -0.2, 0.5) m" in err
     assert "no orientation" in err or "without orientations" in err
@@ -118,8 +118,8 @@ def test_the_origin_needs_no_rotation(inside):
     sigma = np.sqrt(np.diagonal(d.P, axis1=1, axis2=2))
     own = lines("est.txt", "", [d.t, *d.own.T, *sigma.T], " ")
     record = cs.read(own, truth=truth)
-    assert record.parts == ((0,), (1,), (2,))
-    assert_allclose(record.nees[0], ((d.true - d.own)[:, :3] ** 2 / sigma[:, :3] ** 2).sum(axis=1), rtol=1e-9)
+    assert record.errors.parts == ((0,), (1,), (2,))
+    assert_allclose(record.errors.nees[0], ((d.true - d.own)[:, :3] ** 2 / sigma[:, :3] ** 2).sum(axis=1), rtol=1e-9)
     with pytest.raises(cs.InputError, match=r"est\.txt, line 1: --lever-arm moves errors of the rotation.*not stated"):
         cs.read(own, truth=truth, lever_arm=[0.0, 0.0, 0.1])
     upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
@@ -127,7 +127,7 @@ def test_the_origin_needs_no_rotation(inside):
     blocks = lines("blocks.txt", "", [d.t, *d.own.T, *split], " ")
     e, C = (d.true - d.own)[:, :3], d.P[:, :3, :3]
     nees = [each @ np.linalg.solve(P, each) for each, P in zip(e, C, strict=True)]
-    assert_allclose(cs.read(blocks, truth=truth).nees[0], nees, rtol=1e-9)
+    assert_allclose(cs.read(blocks, truth=truth).errors.nees[0], nees, rtol=1e-9)
     with pytest.raises(cs.InputError, match="--error right moves errors"):
         cs.read(blocks, truth=truth, error="right")
 
@@ -151,9 +151,9 @@ def test_a_frame_is_fitted_to_positions(inside):
     truth = bare(d, d.true[:, :3])
     record = cs.read(tum(Drive(d.t, away, d.true, C @ P @ C.T)), truth=truth, align="posyaw-all")
     straight = cs.read(tum(Drive(d.t, own, d.true, P)), truth=truth)
-    assert record.align == "posyaw-all"
-    assert record.nees.sum() < straight.nees.sum() * (1 + 1e-6)
-    assert_allclose(record.error[0], straight.error[0], atol=5e-5)
+    assert record.fit.align == "posyaw-all"
+    assert record.errors.nees.sum() < straight.errors.nees.sum() * (1 + 1e-6)
+    assert_allclose(record.errors.error[0], straight.errors.error[0], atol=5e-5)
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_speeds_are_motions_with_their_covariances(inside):
     true = walked(t, v * 1.02, omega + 0.03)
     lines("truth.csv", "t,x,y,heading", [t, *true.T])
     record = cs.read("odo.csv", truth="truth.csv", motions=True, relative=1, error="left")
-    assert record.notes[0].startswith(
+    assert record.origin.notes[0].startswith(
         "odo.csv: read as speed and turn rate, each held until the next, integrated to motions"
     )
     dt, a, b = 0.25, omega[:-1] * 0.25, (omega[:-1] + 0.03) * 0.25
@@ -252,7 +252,7 @@ def test_speeds_are_motions_with_their_covariances(inside):
         D, M = (arc(speed * v[k] * dt, turn[k]) for speed, turn in ((1.0, a), (1.02, b)))
         e = log(np.linalg.solve(D, M))
         nees.append(e @ np.linalg.solve(C, e))
-    assert_allclose(record.nees.ravel(), nees, rtol=1e-5)
+    assert_allclose(record.errors.nees.ravel(), nees, rtol=1e-5)
 
 
 def arc(way, turn):
@@ -295,9 +295,9 @@ def test_planar_estimates_against_a_truth_in_space(inside):
     own = [t, true[:, 0] - 0.1, true[:, 1], heading + 0.2]
     lines("est.csv", ",".join(["t,x,y,theta", *P]), [*own, zero + 0.04, zero, zero, zero + 0.04, zero, zero + 0.16])
     (record,) = read_recordings(Path("est.csv"), Path("data.csv"))
-    assert_allclose(record.nees, 0.1**2 / 0.04 + 0.2**2 / 0.16, rtol=1e-9)
-    assert record.notes[0] == "est.csv: read as planar poses, 10 columns, seconds"
-    assert record.notes[1].endswith("quaternion w first, of which the heading is that of the x axis")
+    assert_allclose(record.errors.nees, 0.1**2 / 0.04 + 0.2**2 / 0.16, rtol=1e-9)
+    assert record.origin.notes[0] == "est.csv: read as planar poses, 10 columns, seconds"
+    assert record.origin.notes[1].endswith("quaternion w first, of which the heading is that of the x axis")
 
 
 def test_the_robots_of_mrclam_as_they_are():

@@ -317,7 +317,7 @@ def test_one_truth_for_all_runs_stands_where_the_user_does(place, capsys):
     assert status == 2
     assert "write --truth {here}/truth.csv" in err
     assert monte_carlo("--truth", "{here}/truth.csv", *words, capsys=capsys)[0] == 0
-    assert cs.read(place / "out").error.shape == (4, STEPS, 3)  # type: ignore[union-attr]
+    assert cs.read(place / "out").errors.error.shape == (4, STEPS, 3)  # type: ignore[union-attr]
 
 
 # --- runs that fail ----------------------------------------------------------------------------------------
@@ -391,7 +391,7 @@ def test_estimates_that_end_before_their_truth_have_failed(place, capsys):
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {4: "its estimates end at 2, its truth at 4"}
     table = np.loadtxt(place / "tables/6.csv", delimiter=",", skiprows=1)
-    np.testing.assert_allclose(cs.read(place / "out").error[6], table[:, 4:7] - table[:, 1:4])  # its own truth
+    np.testing.assert_allclose(cs.read(place / "out").errors.error[6], table[:, 4:7] - table[:, 1:4])  # its own truth
     script(place, text + "head -n 3 all.csv > estimates.csv")  # this is how the program works
     monte_carlo(*words, capsys=capsys)
     assert failures(place / "out", capsys) == {}

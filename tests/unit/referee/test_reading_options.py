@@ -1,7 +1,7 @@
 """Options of files: one record for readers, commands and Python; tables in memory are read as files of them are."""
 
 import inspect
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pandas as pd
@@ -10,9 +10,10 @@ from command import consistency
 from draws import identities
 from numpy.testing import assert_allclose
 from recorded import read_recordings
+from records import changed
 
 import consistency as cs
-from consistency.diagnostics import Record
+from consistency.diagnostics import make_record
 from consistency.referee.notebook import read_and_judge
 from consistency.referee.readers.options import MAX_DT, Reading, flag_of
 from consistency.referee.readers.pipeline.read_files import own_names
@@ -59,11 +60,11 @@ def test_readers_take_tolerance_and_offset(tables):
     with pytest.raises(cs.InputError, match=r"within 0\.01 s \(--max-dt\)"):
         read_recordings(*tables, state=["a", "b"])
     (near,) = read_recordings(*tables, state=["a", "b"], max_dt=0.3)
-    assert_allclose(near.error[0], [[-0.1, -0.3]] * 8, atol=1e-12)
+    assert_allclose(near.errors.error[0], [[-0.1, -0.3]] * 8, atol=1e-12)
     (moved,) = read_recordings(*tables, state=["a", "b"], time_offset=-0.3)
-    assert_allclose(moved.error[0], [[-0.4, 0.0]] * 8, atol=1e-12)
+    assert_allclose(moved.errors.error[0], [[-0.4, 0.0]] * 8, atol=1e-12)
     (whole,) = read_recordings(*tables, state=["a", "b"], time_offset=-1, max_dt=0.3)
-    assert_allclose(whole.error[0], [[-1.1, 0.7]] * 8, atol=1e-12)
+    assert_allclose(whole.errors.error[0], [[-1.1, 0.7]] * 8, atol=1e-12)
 
 
 def test_windows_are_moved_by_an_offset(tmp_path):
@@ -74,7 +75,7 @@ def test_windows_are_moved_by_an_offset(tmp_path):
     with pytest.raises(cs.InputError, match=r"within 0\.01 s \(--max-dt\)"):
         read_recordings(*files, relative=2, motions=True)
     (record,) = read_recordings(*files, time_offset=-0.5, relative=2, motions=True)
-    assert_allclose(record.error, np.zeros((1, 5, 3)), atol=1e-12)
+    assert_allclose(record.errors.error, np.zeros((1, 5, 3)), atol=1e-12)
 
 
 def test_motions_has_no_opposite(capsys):
@@ -129,11 +130,13 @@ def test_a_table_is_read_as_its_file(wrap, tmp_path):
     truth.to_csv(tmp_path / "truth.csv", index=False)
     files = cs.read(tmp_path / "own.csv", truth=tmp_path / "truth.csv", state=["a", "b"])
     record = cs.read(wrap(own), truth=wrap(truth), state=["a", "b"])
-    assert_allclose(record.nees, files.nees, rtol=1e-9)
+    assert_allclose(record.errors.nees, files.errors.nees, rtol=1e-9)
     e = truth[["a", "b"]].to_numpy() - own[["a", "b"]].to_numpy()
-    assert_allclose(record.nees.ravel(), np.einsum("ni,ni->n", e, np.linalg.solve([[2.0, 0.5], [0.5, 1.0]], e.T).T))
+    assert_allclose(
+        record.errors.nees.ravel(), np.einsum("ni,ni->n", e, np.linalg.solve([[2.0, 0.5], [0.5, 1.0]], e.T).T)
+    )
     mixed = cs.read(wrap(own), truth=tmp_path / "truth.csv", state=["a", "b"])
-    assert_allclose(mixed.nees, files.nees, rtol=1e-9)
+    assert_allclose(mixed.errors.nees, files.errors.nees, rtol=1e-9)
     assert record.name == "estimates"
 
 
@@ -146,7 +149,7 @@ def test_columns_are_called_as_their_user_does(tmp_path):
     assert verdict.statistics["axes"] == ("pos_n", "pos_e")
     assert {"pos_n", "pos_e"} <= set(verdict.axes.inflation)
     record = cs.read(own, truth=truth, state=["a", "b"], columns=columns)
-    assert (record.axes, record.names) == (("a", "b"), ("pos_n", "pos_e"))
+    assert (record.errors.axes, record.errors.names) == (("a", "b"), ("pos_n", "pos_e"))
 
 
 @pytest.mark.parametrize(
@@ -160,18 +163,18 @@ def test_columns_are_called_as_their_user_does(tmp_path):
     ],
 )
 def test_components_have_names_of_columns_whose_error_is_theirs(of_record, columns, align, names):
-    record = replace(Record("f", axes=("x", "y", "vx"), convention="so3"), **of_record)
+    record = changed(make_record("f", axes=("x", "y", "vx"), convention="so3"), **of_record)
     own = own_names(record, Reading(columns=columns, align=align))
-    assert replace(record, own_names=own).names == names
+    assert changed(record, own_names=own).errors.names == names
 
 
 def test_blocks_are_known_whatever_their_axes_are_called(rng):
-    record = Record("f", rng.standard_normal((30, 5, 4)), np.eye(4), axes=("x", "y", "heading", "vx"))
-    record = replace(record, covariance=np.broadcast_to(np.eye(4), (30, 5, 4, 4)), own_names={"x": "n", "y": "e"})
+    record = make_record("f", rng.standard_normal((30, 5, 4)), np.eye(4), axes=("x", "y", "heading", "vx"))
+    record = changed(record, covariance=np.broadcast_to(np.eye(4), (30, 5, 4, 4)), own_names={"x": "n", "y": "e"})
     verdict = cs.judge(record)
     assert verdict.statistics["groups"]["position"] == [0, 1]
     assert verdict.accuracy.rmse_position == pytest.approx(np.hypot(*verdict.accuracy.rmse[:2]))
-    parts = cs.judge(replace(record, parts=((0, 1), (2,), (3,))))
+    parts = cs.judge(changed(record, parts=((0, 1), (2,), (3,))))
     assert list(parts.parts) == ["n, e", "heading", "vx"]
 
 
@@ -179,10 +182,10 @@ def test_a_truth_that_is_named_in_part_is_said_not_to_be_used(tmp_path):
     own, truth = frames()
     own["true_a"], own["nis"], own["nis_dof"] = truth["a"], 1.0, 2
     record = cs.read(own, state=["a", "b"])
-    assert record.error is None
-    assert any("only the NIS is read" in note and "column 'true_b' is missing" in note for note in record.notes)
+    assert record.errors.error is None
+    assert any("only the NIS is read" in note and "column 'true_b' is missing" in note for note in record.origin.notes)
     own["true_b"] = truth["b"]
-    assert not any("only the NIS" in note for note in cs.read(own, state=["a", "b"]).notes)
+    assert not any("only the NIS" in note for note in cs.read(own, state=["a", "b"]).origin.notes)
 
 
 def test_missing_values_and_filters(tmp_path):

@@ -178,8 +178,8 @@ def write_trajectories(at, convention, order="translation-rotation", triangle=Fa
 
 def mean_nees(at, convention, order=None):
     [recording] = read_recordings(at / "est", at / "truth", at / "P", convention, covariance_order=order)
-    assert recording.error.shape == (RUNS, STEPS, 6)
-    return float(nees(recording.error, recording.covariance).mean())
+    assert recording.errors.error.shape == (RUNS, STEPS, 6)
+    return float(nees(recording.errors.error, recording.errors.covariance).mean())
 
 
 BAND = stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], 6 * RUNS * STEPS) / (RUNS * STEPS)
@@ -218,14 +218,14 @@ def test_layouts_of_one_line(tmp_path):
         np.savetxt(tmp_path / name, rows, fmt="%.17g")
     for name in ("44.txt", "29.txt"):
         [one] = read_recordings(tmp_path / name, truth, None, "so3-body")
-        assert_allclose(one.error, whole.error)
-        assert_allclose(one.covariance, whole.covariance, rtol=1e-12)
+        assert_allclose(one.errors.error, whole.errors.error)
+        assert_allclose(one.errors.covariance, whole.errors.covariance, rtol=1e-12)
     position, rotation = read_recordings(tmp_path / "20.txt", truth)
-    assert (position.axes, rotation.axes) == (("x", "y", "z"), ("roll", "pitch", "yaw"))
+    assert (position.errors.axes, rotation.errors.axes) == (("x", "y", "z"), ("roll", "pitch", "yaw"))
     assert (position.name, rotation.name) == ("20 position", "20 rotation")
-    assert_allclose(position.error, whole.error[..., :3])
-    assert_allclose(rotation.error, whole.error[..., 3:])
-    assert_allclose(rotation.covariance, whole.covariance[..., 3:, 3:], rtol=1e-12)
+    assert_allclose(position.errors.error, whole.errors.error[..., :3])
+    assert_allclose(rotation.errors.error, whole.errors.error[..., 3:])
+    assert_allclose(rotation.errors.covariance, whole.errors.covariance[..., 3:, 3:], rtol=1e-12)
 
 
 def test_runs_of_different_lengths_and_gaps(tmp_path):
@@ -233,12 +233,12 @@ def test_runs_of_different_lengths_and_gaps(tmp_path):
     shorten(tmp_path / "est/run1.txt", slice(0, 50))
     shorten(tmp_path / "truth/run2.txt", slice(20, None))
     [r] = read_recordings(tmp_path / "est", tmp_path / "truth", tmp_path / "P")
-    there = np.isfinite(r.covariance[:, :, 0, 0])
+    there = np.isfinite(r.errors.covariance[:, :, 0, 0])
     assert there[1].tolist() == [True] * 50 + [False] * 30
     assert there[2].tolist() == [False] * 20 + [True] * 60  # a common clock keeps the steps in place
     assert there[[0, *range(3, RUNS)]].all()
-    assert any("20 of 370 estimates have no truth" in note for note in r.notes)
-    assert any("1 run of 5 (1) end before step 80" in note for note in r.notes)
+    assert any("20 of 370 estimates have no truth" in note for note in r.origin.notes)
+    assert any("1 run of 5 (1) end before step 80" in note for note in r.origin.notes)
     assert r.failures == ()
 
 
@@ -269,9 +269,9 @@ def test_a_failing_trajectory_and_warnings(tmp_path):
     assert [(f.run, f.step) for f in r.failures] == [(3, 21)]
     assert r.failures[0].reason.startswith("estimate is not finite (")
     assert r.failures[0].reason.endswith("run3.txt, line 21)")
-    assert np.isnan(r.error[3, 20:]).all()
-    assert any("degrees in the median" in note for note in r.notes)
-    assert any("give a truth of a higher rate" in note for note in r.notes)
+    assert np.isnan(r.errors.error[3, 20:]).all()
+    assert any("degrees in the median" in note for note in r.origin.notes)
+    assert any("give a truth of a higher rate" in note for note in r.origin.notes)
 
 
 @pytest.mark.parametrize(
@@ -295,13 +295,13 @@ def test_a_planar_robot_in_messages_of_six(spatial_kind, planar_kind, tmp_path):
     np.savetxt(tmp_path / "P.txt", np.column_stack([t, P.reshape(n, 36)]), fmt="%.17g")
     files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
     [r] = read_recordings(*files, spatial_kind, axes=["x", "y", "yaw"])
-    assert r.axes == ("x", "y", "yaw")
-    assert_allclose(r.error[0], planar_error(true, own, planar_kind), atol=1e-12)
-    assert_allclose(r.covariance[0], P3, rtol=1e-12)
+    assert r.errors.axes == ("x", "y", "yaw")
+    assert_allclose(r.errors.error[0], planar_error(true, own, planar_kind), atol=1e-12)
+    assert_allclose(r.errors.covariance[0], P3, rtol=1e-12)
     [in_space] = read_recordings(*files, spatial_kind)  # what never changes is left out
-    assert in_space.axes == ("x", "y", "yaw")
-    assert_allclose(in_space.error, r.error)
-    assert any("--axes x,y,yaw" in note for note in in_space.notes)
+    assert in_space.errors.axes == ("x", "y", "yaw")
+    assert_allclose(in_space.errors.error, r.errors.error)
+    assert any("--axes x,y,yaw" in note for note in in_space.origin.notes)
     with pytest.raises(InputError, match=r"--axes x,heading: 'heading' is not one of x, y, z, roll, pitch, yaw"):
         read_recordings(*files, axes=["x", "heading"])
 
@@ -371,10 +371,15 @@ def test_a_table_is_read_back_to_the_last_digit(tmp_path):
     est, true = poses()
     r = one(*write(tmp_path))
     expected = true[["x", "y", "heading"]].to_numpy() - est[["x", "y", "heading"]].to_numpy()
-    assert_allclose(r.error, expected.reshape(3, 5, 3), rtol=0, atol=1e-15)  # wrapping rounds once more
-    assert (r.name, r.axes, r.convention, r.runs.tolist()) == ("est", ("x", "y", "heading"), "so2", [0, 1, 2])
-    assert_allclose(r.t, [0.1, 0.2, 0.3, 0.4, 0.5])
-    assert r.covariance[2, 4].tolist() == [[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]]
+    assert_allclose(r.errors.error, expected.reshape(3, 5, 3), rtol=0, atol=1e-15)  # wrapping rounds once more
+    assert (r.name, r.errors.axes, r.errors.convention, r.runs.numbers.tolist()) == (
+        "est",
+        ("x", "y", "heading"),
+        "so2",
+        [0, 1, 2],
+    )
+    assert_allclose(r.runs.t, [0.1, 0.2, 0.3, 0.4, 0.5])
+    assert r.errors.covariance[2, 4].tolist() == [[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]]
     for suffix in ("parquet", "csv"):  # Parquet, shuffled rows, and semicolons: the same
         shuffled = est.sample(frac=1, random_state=1)
         if suffix == "csv":
@@ -382,20 +387,20 @@ def test_a_table_is_read_back_to_the_last_digit(tmp_path):
         else:
             shuffled.to_parquet(tmp_path / "again.parquet")
         again = one(tmp_path / f"again.{suffix}", tmp_path / "truth.csv")
-        assert_array_equal(again.error, r.error)
-        assert_array_equal(again.covariance, r.covariance)
+        assert_array_equal(again.errors.error, r.errors.error)
+        assert_array_equal(again.errors.covariance, r.errors.covariance)
 
 
 def test_without_run_and_step(tmp_path):
     """One run, matched by time; a truth without runs serves all."""
     est, truth = write(tmp_path, lambda e: e[e["run"] == 0].drop(columns=["run", "step"]), lambda t: t[t["run"] == 0])
     alone = one(est, truth)
-    assert alone.runs.tolist() == [0]
-    assert alone.error.shape == (1, 5, 3)
+    assert alone.runs.numbers.tolist() == [0]
+    assert alone.errors.error.shape == (1, 5, 3)
     shared = write(tmp_path, None, lambda t: t[t["run"] == 1].drop(columns=["run", "step"]))
     several = one(*shared)
-    assert several.error.shape == (3, 5, 3)
-    assert several.convention == "so2"
+    assert several.errors.error.shape == (3, 5, 3)
+    assert several.errors.convention == "so2"
 
 
 def test_filters_are_recordings(tmp_path):
@@ -432,10 +437,10 @@ def test_a_broken_row_is_a_failed_run(row, column, value, reason, tmp_path):
     step = row - 5
     assert [(f.filter, f.run, f.step) for f in r.failures] == [("est", 1, step + 1)]
     assert r.failures[0].reason == f"{reason} ({est}, line {row + 2})"
-    assert np.isnan(r.error[1, step:]).all()
-    assert np.isnan(r.covariance[1, step:]).all()
-    assert np.isfinite(r.error[1, :step]).all()
-    assert np.isfinite(r.error[[0, 2]]).all()
+    assert np.isnan(r.errors.error[1, step:]).all()
+    assert np.isnan(r.errors.covariance[1, step:]).all()
+    assert np.isfinite(r.errors.error[1, :step]).all()
+    assert np.isfinite(r.errors.error[[0, 2]]).all()
     verdict = judge_all([r])["est"]
     assert not verdict.consistent
     assert verdict.statistics["failures"] == [[1, step + 1, r.failures[0].reason]]
@@ -448,11 +453,11 @@ def test_a_start_known_exactly_is_left_out(tmp_path):
 
     r = one(*write(tmp_path, singular))
     assert r.failures == ()
-    assert np.isnan(r.nees[:, :2]).all()
-    assert np.isnan(r.covariance[:, :2]).all()
-    assert_allclose(r.nees[:, 2:], nees(r.error[:, 2:], r.covariance[:, 2:]))
-    assert np.isfinite(r.error).all()
-    assert any("6 estimates before the covariance has full rank" in note for note in r.notes)
+    assert np.isnan(r.errors.nees[:, :2]).all()
+    assert np.isnan(r.errors.covariance[:, :2]).all()
+    assert_allclose(r.errors.nees[:, 2:], nees(r.errors.error[:, 2:], r.errors.covariance[:, 2:]))
+    assert np.isfinite(r.errors.error).all()
+    assert any("6 estimates before the covariance has full rank" in note for note in r.origin.notes)
     assert judge_all([r])["est"].statistics["left_out_steps"] == [1, 2]
 
 
@@ -461,24 +466,24 @@ def test_step_0_is_the_start_only_where_nothing_is_uncertain(tmp_path):
         table["step"] -= 1
 
     kept = one(*write(tmp_path, shift, shift))
-    assert kept.error.shape == (3, 5, 3)
-    assert any("which has 0 to 4" in note for note in kept.notes)
+    assert kept.errors.error.shape == (3, 5, 3)
+    assert any("which has 0 to 4" in note for note in kept.origin.notes)
 
     def exact(table):
         shift(table)
         table.loc[table["step"] == 0, POSE_COLUMNS] = 0.0
 
     start = one(*write(tmp_path, exact, shift))
-    assert start.error.shape == (3, 4, 3)
-    assert_array_equal(start.error, kept.error[:, 1:])
+    assert start.errors.error.shape == (3, 4, 3)
+    assert_array_equal(start.errors.error, kept.errors.error[:, 1:])
 
 
 def test_short_and_missing_runs_are_told(tmp_path):
     r = one(*write(tmp_path, lambda e: e[(e["run"] != 1) & ((e["run"] != 2) | (e["step"] < 4))]))
-    assert r.runs.tolist() == [0, 2]
-    assert np.isnan(r.error[1, 3:]).all()
-    assert any("no estimates of 1 run of the truth (1)" in note for note in r.notes)
-    assert any("1 run of 2 (2) end before step 5" in note for note in r.notes)
+    assert r.runs.numbers.tolist() == [0, 2]
+    assert np.isnan(r.errors.error[1, 3:]).all()
+    assert any("no estimates of 1 run of the truth (1)" in note for note in r.origin.notes)
+    assert any("1 run of 2 (2) end before step 5" in note for note in r.origin.notes)
 
 
 def test_nis_alone(tmp_path):
@@ -488,7 +493,7 @@ def test_nis_alone(tmp_path):
     table.loc[3, ["nis", "nis_dof"]] = np.nan
     table.to_csv(tmp_path / "nis.csv", index=False)
     r = one(tmp_path / "nis.csv", None)
-    assert (r.error, r.covariance, r.nees, r.dof) == (None, None, None, 0)
+    assert (r.errors.error, r.errors.covariance, r.errors.nees, r.errors.dof) == (None, None, None, 0)
     undeclared = judge_all([r])["nis"]
     assert (undeclared.status, undeclared.faults) == ("undecided", ())
     assert "declares an optimal gain" in undeclared.reasons[0]
@@ -524,14 +529,14 @@ def test_three_kinds_of_archives_agree(tmp_path):
     """Consistent errors: false-alarm rate 0.05 of the verdict, so it is asked at 1 - 1e-4."""
     arrays = gaussian()
     by_error = one(archive(tmp_path, **arrays, axes=["px", "py"]), None)
-    assert by_error.axes == ("px", "py")
+    assert by_error.errors.axes == ("px", "py")
     truth = np.random.default_rng(6).normal(size=(40, 30, 2))
     estimates = {"estimates": truth - arrays["errors"], "truth": truth, "covariances": arrays["covariances"]}
     by_truth = one(archive(tmp_path, **estimates), None)
-    assert_allclose(by_truth.error, by_error.error, atol=1e-12)
+    assert_allclose(by_truth.errors.error, by_error.errors.error, atol=1e-12)
     values = nees(error=arrays["errors"], covariance=arrays["covariances"])
     by_nees = one(archive(tmp_path, nees=values, dof=2), None)
-    assert by_nees.error is None
+    assert by_nees.errors.error is None
     for r in (by_error, by_truth, by_nees):
         verdict = judge_all([r], settings=Settings(false_alarm=1e-4))["a"]
         assert verdict.status == "consistent"
@@ -553,15 +558,15 @@ def test_lengths_failures_and_starts_of_archives(tmp_path):
     values[0, 0] = values[1, 3] = np.nan
     r = one(archive(tmp_path, nees=values, dof=2), None)
     assert [(f.run, f.step) for f in r.failures] == [(1, 4)]
-    assert np.isnan(r.nees[1]).tolist() == [False, False, False, True, True]
+    assert np.isnan(r.errors.nees[1]).tolist() == [False, False, False, True, True]
 
 
 def test_poses_in_an_archive_take_a_convention(tmp_path):
     est, true = poses()
     estimates, truth = (table[["x", "y", "heading"]].to_numpy().reshape(3, 5, 3) for table in (est, true))
     path = archive(tmp_path, estimates=estimates, truth=truth, covariances=np.tile(np.eye(3), (3, 5, 1, 1)))
-    assert_allclose(one(path, None, error="left").error, planar_error(truth, estimates, "left"))
-    assert_allclose(one(path, None).error, truth - estimates)
+    assert_allclose(one(path, None, error="left").errors.error, planar_error(truth, estimates, "left"))
+    assert_allclose(one(path, None).errors.error, truth - estimates)
 
 
 # --- the commands of the manual ----------------------------------------------------------------------

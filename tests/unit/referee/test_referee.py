@@ -19,13 +19,13 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 
 import consistency as cs
 from consistency.diagnostics import (
-    Record,
     Settings,
     answers,
     coverage_interval,
     gate_runs,
     hotelling,
     identity_statistic,
+    make_record,
     mean_shape,
     nis_test,
     noncredibility,
@@ -302,13 +302,13 @@ def test_outliers_of_a_conservative_filter_are_outliers_for_the_stated_covarianc
     settings = Settings(false_alarm=1e-3, allow="conservative")
     nees = float(np.square(w).sum(axis=-1).max())
     assert beyond_stated(w) == pytest.approx(min(1.0, 2500 * stats.chi2.sf(nees, 3)))
-    verdict = judge_record(Record("f", error=w, covariance=covariance), settings)
+    verdict = judge_record(make_record("f", error=w, covariance=covariance), settings)
     (p,) = (answer.p_value for answer in verdict.answers if answer.question == "outliers")
     assert p == pytest.approx(max(outliers(w).p_value, beyond_stated(w)))
     assert "outliers" not in verdict.faults
     w[3, 7] = 12.0, 0.0, 0.0
     assert beyond_stated(w) == pytest.approx(2500 * stats.chi2.sf(144, 3))
-    assert "outliers" in judge_record(Record("f", error=w, covariance=covariance), settings).faults
+    assert "outliers" in judge_record(make_record("f", error=w, covariance=covariance), settings).faults
 
 
 def test_whiteness_needs_more_innovations_of_more_components(fresh):

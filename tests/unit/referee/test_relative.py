@@ -12,6 +12,7 @@ import relative_poses as world
 from command import consistency, refused
 from documents import ROOT
 from numpy.testing import assert_allclose
+from records import changed
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
@@ -113,7 +114,7 @@ def test_declared_windows_are_runs(rng):
     record = world.relative_recording("log", "log", runs, AXES["SE(2)"], range(3), relative)
     verdict = judge_all([record])["log"]
     assert (verdict.runs, verdict.steps, verdict.unit) == (30, 1, "window")
-    assert_allclose(verdict.scale.mean_anees, np.mean(record.nees))
+    assert_allclose(verdict.scale.mean_anees, np.mean(record.errors.nees))
 
 
 def declared(rng, windows, steps=10):
@@ -135,7 +136,7 @@ def test_few_windows_do_not_show_independence(rng):
     assert not few.equivalence.shown
     enough = judge_all([declared(rng, ENOUGH)])["log"]
     assert enough.status == "overconfident"
-    right = replace(declared(rng, 30), unshown="")
+    right = changed(declared(rng, 30), unshown="")
     assert judge_all([right])["log"].runs == 30
     base = baseline([declared(rng, 50)], "log")
     with pytest.raises(cs.InputError, match="at least 8 runs"):
@@ -168,14 +169,14 @@ def motion_file(tmp_path, rng):
 
 def test_motions_as_tum(motion_file):
     record = cs.read(motion_file, motion_file.parent / "truth.tum", relative="1s", motions=True)
-    assert record.window == "1 s"
-    assert record.error.shape == (1, 12, 6)
-    assert_allclose(record.t, np.arange(1, 13), atol=1e-9)
+    assert record.origin.window == "1 s"
+    assert record.errors.error.shape == (1, 12, 6)
+    assert_allclose(record.runs.t, np.arange(1, 13), atol=1e-9)
     planar = cs.read(
         motion_file, motion_file.parent / "truth.tum", relative=10, motions=True, axes=["x", "y", "yaw"]
     )  # fmt: skip
-    assert planar.axes == ("x", "y", "yaw")
-    assert_allclose(planar.error, record.error[:, :, [0, 1, 5]], atol=1e-12)
+    assert planar.errors.axes == ("x", "y", "yaw")
+    assert_allclose(planar.errors.error, record.errors.error[:, :, [0, 1, 5]], atol=1e-12)
 
 
 def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
@@ -186,8 +187,8 @@ def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
     P = lines(tmp_path / "P.txt", s.t, s.covariance.reshape(-1, 36), cross)
     record = cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=1)
     found = windows_of(s, Relative(1, "step"))
-    assert_allclose(record.covariance[0], found.covariance, rtol=1e-9)
-    assert_allclose(record.error[0], found.error, atol=1e-12)
+    assert_allclose(record.errors.covariance[0], found.covariance, rtol=1e-9)
+    assert_allclose(record.errors.error[0], found.error, atol=1e-12)
     with pytest.raises(cs.InputError, match="line 3: --relative 2: the window spans 2 rows"):
         cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=2)
     keep = np.arange(9) != 4
@@ -212,9 +213,9 @@ def test_tables_and_archives_of_motions(tmp_path, rng):
     s = motion_stretch(drive(rng, "SE(2)", 40))
     expected = recorded([s], "5", True)
     record = cs.read(table(tmp_path / "m.csv", s, False), tmp_path / "truth.csv", relative="0.5s", motions=True)
-    assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
     np.savez(tmp_path / "m.npz", estimates=s.estimate, truth=s.truth, covariances=s.covariance)
-    assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).nees, expected.nees, rtol=1e-9)
+    assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).errors.nees, expected.errors.nees, rtol=1e-9)
     with pytest.raises(cs.InputError, match="--relative 1s needs a column t"):
         cs.read(tmp_path / "m.npz", relative="1s", motions=True)
 
@@ -223,10 +224,10 @@ def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path, rng):
     s = pose_stretch(rng, "SE(2)", 9, 5, 1.0, 0)
     expected = recorded([s], "1", False)
     record = cs.read(table(tmp_path / "p.csv", s, True), tmp_path / "truth.csv", relative=1)
-    assert_allclose(record.nees, expected.nees, rtol=1e-9)
+    assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
     arrays = {"estimates": s.estimate, "truth": s.truth, "covariances": s.covariance, "cross_covariances": s.cross}
     np.savez(tmp_path / "p.npz", **arrays)
-    assert_allclose(cs.read(tmp_path / "p.npz", relative=1).nees, expected.nees, rtol=1e-9)
+    assert_allclose(cs.read(tmp_path / "p.npz", relative=1).errors.nees, expected.errors.nees, rtol=1e-9)
     declared = cs.read(tmp_path / "p.npz", relative=1, windows="independent")
     assert cs.judge(declared).runs == 8
     np.savez(tmp_path / "q.npz", **arrays | {"cross_covariances": s.cross[:4]})

@@ -201,7 +201,7 @@ def test_a_log_that_is_broken_from_the_start(rng):
         stretch.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
-        assert not any("first order" in note for note in record.notes)
+        assert not any("first order" in note for note in record.origin.notes)
         assert windows_of(stretch, NEXT).track.t.tolist() == [stretch.t[0]]
         assert judge_all([record])["log"].status == "failed"
 
@@ -211,19 +211,19 @@ def test_neighbours_that_go_together_are_named(rng):
     simulated = drive(rng, "SE(2)", 200)
     biased = simulated.motions @ exp(np.array([[0.1, 0.0, 0.0]]) + 0.01 * rng.normal(size=(200, 3)))
     truth = composed(np.concatenate([np.eye(3)[None], biased]))
-    notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).notes
+    notes = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True).origin.notes
     assert any("neighbouring windows go the same way" in note for note in notes)
     steps = Relative(1, "step", True)
     stretch = motion_stretch(replace(simulated, truth=truth))
     undeclared = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), steps)
-    assert not any("neighbouring" in note for note in undeclared.notes)
+    assert not any("neighbouring" in note for note in undeclared.origin.notes)
     jitter = simulated.truth @ exp(rng.normal(size=(201, 3)) * [0.3, 0.3, 0.0])
-    notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).notes
+    notes = recorded([motion_stretch(replace(simulated, truth=jitter))], "1", True).origin.notes
     assert any("neighbouring windows go opposite ways" in note for note in notes)
 
 
 def test_motions_are_judged_however_few(rng):
-    assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).unshown == ""
+    assert recorded([motion_stretch(drive(rng, "SE(2)", 20))], "1", True).origin.unshown == ""
 
 
 def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng):
@@ -235,17 +235,19 @@ def test_windows_whose_sizes_go_on_are_doubted_in_the_sentence(rng):
     moved = simulated.motions @ exp(size * rng.normal(size=(400, n)) @ root.T)
     truth = composed(np.concatenate([np.eye(3)[None], moved]))
     record = recorded([motion_stretch(replace(simulated, truth=truth))], "1", True)
-    assert any("errors of neighbouring windows are of like size" in note for note in record.notes)
+    assert any("errors of neighbouring windows are of like size" in note for note in record.origin.notes)
     verdict = judge_all([record])["log"]
     assert verdict.reasons[0].endswith("the motions do not seem to be independent, on which this rests")
     plain_one = recorded([motion_stretch(drive(rng, "SE(2)", 19))], "1", True)
-    assert (plain_one.caption, plain_one.unshown) == ("", "")
+    assert (plain_one.fit.caption, plain_one.origin.unshown) == ("", "")
 
 
 def test_windows_too_wide_for_first_order_are_named(rng):
     simulated = drive(rng, "SE(2)", 200, sigma=np.array([0.01, 0.01, 0.05]))
-    assert any("to first order is doubtful" in note for note in recorded([motion_stretch(simulated)], "50", True).notes)
-    assert not any("first order" in note for note in recorded([motion_stretch(simulated)], "1", True).notes)
+    assert any(
+        "to first order is doubtful" in note for note in recorded([motion_stretch(simulated)], "50", True).origin.notes
+    )
+    assert not any("first order" in note for note in recorded([motion_stretch(simulated)], "1", True).origin.notes)
 
 
 def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng):
@@ -284,13 +286,13 @@ def test_runs_have_windows_by_their_times_where_those_are_known(rng):
     first, second = (motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2))
     late = second.beside(np.arange(4, 13))
     record = recorded([first, late], "2", True)
-    assert_allclose(record.t, first.t[[2, 4, 6, 8, 10, 12]])
-    assert_array_equal(np.isnan(record.error[:, :, 0]).sum(axis=1), [0, 2])
-    assert np.isnan(record.error[1, :2]).all()
+    assert_allclose(record.runs.t, first.t[[2, 4, 6, 8, 10, 12]])
+    assert_array_equal(np.isnan(record.errors.error[:, :, 0]).sum(axis=1), [0, 2])
+    assert np.isnan(record.errors.error[1, :2]).all()
     timeless = [replace(each, numbered=True) for each in (first, late)]
     record = recorded(timeless, "2", True)
-    assert np.isnan(record.t).all()
-    assert np.isnan(record.error[1, 4:]).all()
+    assert np.isnan(record.runs.t).all()
+    assert np.isnan(record.errors.error[1, 4:]).all()
 
 
 # --- notes ---------------------------------------------------------------------------------------------
@@ -298,21 +300,21 @@ def test_runs_have_windows_by_their_times_where_those_are_known(rng):
 
 def test_notes_say_what_windows_are_of(rng):
     planar = recorded([motion_stretch(drive(rng, "SE(2)", 19)), motion_stretch(drive(rng, "SE(2)", 19), 1)], "2", True)
-    assert planar.notes[0] == (
+    assert planar.origin.notes[0] == (
         "log: relative poses over 18 windows of 2 steps; the error is Log(estimated^-1 true motion) of SE(2), in the "
         "frame of the body at the end of a window; covariances of motions are of the error so2"
     )
-    assert planar.notes[2:] == (
+    assert planar.origin.notes[2:] == (
         "log: errors of different motions are declared to be independent: each window is a run",
     )
     spatial = recorded([pose_stretch(rng, "SE(3)", 9, 5, 1.0, 0)], "1", False)
-    assert "over 8 windows of 1 step; the error is Log(estimated^-1 true motion) of SE(3)" in spatial.notes[0]
-    assert "covariances of poses, with cross-covariances, are of the error so3" in spatial.notes[0]
-    assert [note.split(";")[0] for note in spatial.notes[1:]] == [
+    assert "over 8 windows of 1 step; the error is Log(estimated^-1 true motion) of SE(3)" in spatial.origin.notes[0]
+    assert "covariances of poses, with cross-covariances, are of the error so3" in spatial.origin.notes[0]
+    assert [note.split(";")[0] for note in spatial.origin.notes[1:]] == [
         "log: what is constant over a window, or drifts more slowly than it, is not seen",
         "log: windows are steps of their run, as their errors may depend on each other",
     ]
-    assert (planar.independent, spatial.independent) == (True, False)
+    assert (planar.runs.independent, spatial.runs.independent) == (True, False)
 
 
 def test_windows_that_are_left_out_are_counted(rng):
@@ -323,8 +325,8 @@ def test_windows_that_are_left_out_are_counted(rng):
     found = [windows_of(stretch, Relative(0.1, "s", True, True)) for stretch in some]
     assert [each.left_out for each in found] == [1, 1]
     said = "log: 2 windows left out, too long because rows or truth are missing"
-    assert said in recorded(some, size, True).notes
-    assert not any("left out" in note for note in recorded(stretches, size, True).notes)
+    assert said in recorded(some, size, True).origin.notes
+    assert not any("left out" in note for note in recorded(stretches, size, True).origin.notes)
 
 
 def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng):
@@ -335,6 +337,6 @@ def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng):
         large = [
             replace(stretch, covariance=P * np.where(np.arange(31) < few, 100.0, 1.0)[:, None, None]) for few in (9, 25)
         ]
-        near, far = (next(n for n in recorded([each], "1", True).notes if "first order" in n) for each in large)
+        near, far = (next(n for n in recorded([each], "1", True).origin.notes if "first order" in n) for each in large)
         assert "has a sigma of 0.12 rad in the median; beyond 0.1 a covariance" in near
         assert "has a sigma of 1.2 rad in the median" in far

@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from matplotlib.figure import Figure as Drawn
 from numpy.testing import assert_allclose
 from painted import by_title, legend_of, lines, panels, places, shaded
 from recorded import read_recordings
+from records import changed
 from scipy import stats
 
 import consistency as cs
@@ -57,7 +57,7 @@ def test_the_verdict_stands_on_top_and_the_pictures_first(archive):
 
 
 def test_notes_are_sentences_and_paths_stay_as_they_are(archive):
-    record = replace(cs.read(archive), notes=("g2/est/a.csv: read as poses", "error convention so3"))
+    record = changed(cs.read(archive), notes=("g2/est/a.csv: read as poses", "error convention so3"))
     made = compose_files([record], {"mine": cs.judge(record)}, "mine.npz", {})
     texts = [block.text for block in made.chapters[-1].blocks if isinstance(block, Text)]
     assert texts == ["g2/est/a.csv: read as poses.", "Error convention so3."]
@@ -95,7 +95,9 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive):
     record = read_recordings(archive)[0]
     drawn = panels(by_title(document(archive))["Errors and stated bounds"])
     assert [axes.get_ylabel() for axes in drawn] == ["x (m)", "yaw (deg)"]
-    for axes, factor, variance, error in zip(drawn, (1.0, 180 / np.pi), (0.1, 0.2), record.error[0].T, strict=True):
+    for axes, factor, variance, error in zip(
+        drawn, (1.0, 180 / np.pi), (0.1, 0.2), record.errors.error[0].T, strict=True
+    ):
         (line,), (below,) = lines(axes, "run 0"), lines(axes, "2-sigma bounds")
         assert_allclose(line.get_xdata(), 0.1 * np.arange(STEPS), atol=1e-6)
         assert_allclose(line.get_ydata(), factor * error)
@@ -105,7 +107,7 @@ def test_errors_are_drawn_in_seconds_and_degrees_with_their_bounds(archive):
 
 def test_without_times_steps_are_on_the_axis(tmp_path, rng):
     np.savez(tmp_path / "e.npz", **errors_of(rng))
-    clock = time_axis_of(read_recordings(tmp_path / "e.npz")[0].t)
+    clock = time_axis_of(read_recordings(tmp_path / "e.npz")[0].runs.t)
     assert (clock.word, clock.values[0], clock.values[-1]) == ("step", 1, STEPS)
     assert unit_of("axis 0") == ("", 1.0)
 
@@ -151,8 +153,8 @@ def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
     worst = next(of for of in record_figures(record, cs.judge(record)) if of.title == "Which run, and when")
     of_runs, of_steps = panels(worst)
     assert of_steps.get_ylabel() == "NEES of run 7"
-    assert_allclose(places(of_runs)[0][:, 1], record.nees.mean(axis=1))
-    assert_allclose(places(of_runs)[1], [[7.0, record.nees[7].mean()]])
+    assert_allclose(places(of_runs)[0][:, 1], record.errors.nees.mean(axis=1))
+    assert_allclose(places(of_runs)[1], [[7.0, record.errors.nees[7].mean()]])
 
 
 def test_the_first_steps_set_no_axis(tmp_path, rng):
@@ -191,7 +193,7 @@ def test_runs_of_one_step_stand_side_by_side(tmp_path, rng):
 def test_every_panel_of_a_plot_has_a_legend(steps, tmp_path, rng):
     np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
     record = cs.read(tmp_path / "e.npz")
-    unnamed = replace(record, axes=())
+    unnamed = changed(record, axes=())
     for figure, many in ((record.plot(), 3), (unnamed.plot(), 3), (cs.judge(record).plot(), 4)):
         legends = [axes.get_legend() for axes in figure.axes if axes.axison]
         assert len(legends) == many

@@ -6,20 +6,21 @@ limits at 1e-5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from draws import autoregression, independent, verdict_on
+from records import changed
 from scipy import optimize, special, stats
 
 from consistency.diagnostics import (
-    Record,
     Settings,
     e_process,
     ever,
     gate_runs,
     judge,
+    make_record,
     mean_test,
     pilot_plan,
     power_of,
@@ -528,13 +529,13 @@ def test_a_single_honest_log_is_undecided():
 def test_innovations_of_nearly_the_stated_size_are_tolerated():
     """4 % too small in 40,000 innovations is found, shown to lie within 1.1 and not within 1.02; no chance in it."""
     nis = 1.04 * stats.chi2.ppf((np.random.default_rng(0).permutation(40_000) + 0.5) / 40_000, 2).reshape(400, 100)
-    evidence = Record("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
+    evidence = make_record("f", nis=nis, nis_dof=np.full(nis.shape, 2), optimal_gain=True)
     assert judge(evidence).status == "overconfident"
     verdict = judge(evidence, Settings(tolerance=1.1))
     assert (verdict.status, verdict.faults) == ("consistent", ())
     assert [a.question for a in verdict.answers if a.tolerated] == ["innovation scale"]
     assert judge(evidence, Settings(tolerance=1.02)).status == "overconfident"
-    assert not judge(replace(evidence, optimal_gain=False), Settings(tolerance=1.1)).answers
+    assert not judge(changed(evidence, optimal_gain=False), Settings(tolerance=1.1)).answers
 
 
 # --- runs that a verdict takes, from a few runs ---------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from draws import fully_dependent, identities, independent
 from scipy import stats
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
 from consistency.referee.diagnostics.words.numbers import ratio_text, short
@@ -28,7 +28,7 @@ AXES = ("x", "y", "heading")
 def judged(error, stated=None, **settings):
     P = identities(error) if stated is None else np.broadcast_to(stated, (*error.shape, error.shape[-1]))
     axes = AXES[: error.shape[-1]]
-    return judge(Record("f", error, P, axes=axes), Settings(**{"false_alarm": SURE} | settings))  # type: ignore[arg-type]
+    return judge(make_record("f", error, P, axes=axes), Settings(**{"false_alarm": SURE} | settings))  # type: ignore[arg-type]
 
 
 def correlated(rng, true, stated, n=2, runs=100):
@@ -81,7 +81,7 @@ def test_a_small_axis_may_be_the_worst(rng):
     assert (judged(error).worst_axis or ("",))[0] == "y"
     assert (judged(error, allow="conservative").worst_axis or ("",))[0] == "heading"
     assert judged(error[..., :1]).worst_axis is None
-    assert judge(Record("f", nees=np.square(error).sum(axis=-1), dof=3)).worst_axis is None
+    assert judge(make_record("f", nees=np.square(error).sum(axis=-1), dof=3)).worst_axis is None
 
 
 # --- opposite axes -------------------------------------------------------------------------------------------
@@ -130,7 +130,7 @@ def test_few_large_errors_do_not_hide_that_the_mean_is_small(times, status):
     """Quantiles of chi-square, so that there is no chance in it: most runs are smaller than stated, 15 larger."""
     few, most = (stats.chi2.ppf((np.arange(runs) + 0.5) / runs, 2) for runs in (15, 135))
     nees = 0.36 * np.concatenate([most, times * few])[:, None]
-    verdict = judge(Record("f", nees=nees, dof=2), Settings(0.01))
+    verdict = judge(make_record("f", nees=nees, dof=2), Settings(0.01))
     assert (verdict.scale.inflation.high < 1.0) == (status == "inconsistent")
     assert verdict.status == status
     if status == "inconsistent":
@@ -320,7 +320,7 @@ def test_a_shape_in_a_step_says_which(rng):
 def test_a_sentence_names_three_wrong_components_and_counts_the_rest(rng):
     axes = ("a", "b", "c", "d", "e")
     error = 3.0 * independent(rng, 60, 20, 5)
-    record = Record("f", error, identities(error), axes=axes, parts=tuple((k,) for k in range(5)))
+    record = make_record("f", error, identities(error), axes=axes, parts=tuple((k,) for k in range(5)))
     sentence = judge(record, Settings(false_alarm=SURE)).reasons[0]
     assert [f"{axis}: covariance too small" in sentence for axis in axes] == [True, True, True, False, False]
     assert sentence.endswith("; and 2 more")

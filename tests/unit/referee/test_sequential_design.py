@@ -11,7 +11,17 @@ import pytest
 from draws import identities, independent
 from scipy import integrate, stats
 
-from consistency.diagnostics import Design, Record, Verdict, e_process, ever, follow, judge, look, sequential_design
+from consistency.diagnostics import (
+    Design,
+    Verdict,
+    e_process,
+    ever,
+    follow,
+    judge,
+    look,
+    make_record,
+    sequential_design,
+)
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.scale import equivalence, equivalence_by_betting
@@ -28,7 +38,7 @@ def inspections(design, count):
 def evidence_from(error, **more):
     """The first runs of a filter, as many as asked for."""
     P = identities(error)
-    return lambda runs: Record("f", error[:runs], P[:runs], **more)
+    return lambda runs: make_record("f", error[:runs], P[:runs], **more)
 
 
 # --- the grid -----------------------------------------------------------------------------------------
@@ -134,7 +144,7 @@ def test_an_all_clear_takes_thirty_runs():
 def test_an_all_clear_at_a_look_takes_the_test_of_its_runs_too():
     """Two of 48 runs are wrong by x4: bets on the mean show it to be near 1, the test of unlike runs does not."""
     means = np.where(np.arange(48) < 2, 4.0, 0.97)
-    evidence = Record("f", nees=np.broadcast_to(3.0 * means[:, None], (48, 20)), dof=3)
+    evidence = make_record("f", nees=np.broadcast_to(3.0 * means[:, None], (48, 20)), dof=3)
     settings = Design(3).settings
     assert equivalence_by_betting(means, 3, settings).shown
     of_runs = equivalence(means, 3, 20, settings, is_whole=True)
@@ -166,7 +176,7 @@ def test_failed_runs_decide_at_once():
 def test_without_truth_looks_are_at_the_innovations():
     rng = np.random.default_rng(78)
     nis, dof = 2.0 * rng.chisquare(2, (48, 30)), np.full((48, 30), 2)
-    evidence = Record("f", nis=nis, nis_dof=dof, optimal_gain=True)
+    evidence = make_record("f", nis=nis, nis_dof=dof, optimal_gain=True)
     design = Design(3, false_alarm=1e-3)
     assert look(design, evidence, None).status == "undecided"
     at_look = look(design, evidence, 1 / 12)
@@ -261,7 +271,7 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch):
     verdicts = {}
 
     def read(runs, name):
-        return Record(name, runs=np.arange(runs))
+        return make_record(name, runs=np.arange(runs))
 
     counts = list(judge_record.looks(sequential_design(3), ["early", "late"], read, verdicts))
     assert counts == [12, 15, 18, 21, 24]

@@ -14,7 +14,7 @@ from scipy import signal, stats
 from single_log import errors
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions.planning import (
     APART,
     MOST,
@@ -153,21 +153,21 @@ def log(rng, steps, rho=0.0, constant=0.0, ratio=1.0):
     w[1:] *= np.sqrt(1.0 - rho**2)
     e = np.sqrt(1.0 - constant) * signal.lfilter([1.0], [1.0, -rho], w, axis=0)
     e += np.sqrt(constant) * rng.standard_normal((1, N))
-    return Record("log", np.sqrt(ratio) * e[None], identities(e[None]), axes=("x", "y"), t=np.arange(float(steps)))
+    return make_record("log", np.sqrt(ratio) * e[None], identities(e[None]), axes=("x", "y"), t=np.arange(float(steps)))
 
 
 def of(array, name="log"):
-    return Record(name, array, identities(array))
+    return make_record(name, array, identities(array))
 
 
 def test_pieces_are_rows_of_the_log():
     one = log(np.random.default_rng(1), 1003)
     r = in_pieces(one, 25)
-    assert (r.error.shape, r.unit, len(r.run_numbers)) == ((25, 40, N), "piece", 25)
-    assert_array_equal(r.error.reshape(-1, N), one.error[0, :1000])
-    assert (r.times[3, 0], r.run_numbers[0]) == (120.0, 1)
-    assert set(r.unavailable) == set(BIAS)
-    assert not r.unshown
+    assert (r.errors.error.shape, r.runs.unit, len(r.run_numbers)) == ((25, 40, N), "piece", 25)
+    assert_array_equal(r.errors.error.reshape(-1, N), one.errors.error[0, :1000])
+    assert (r.runs.times[3, 0], r.run_numbers[0]) == (120.0, 1)
+    assert set(r.fit.unavailable) == set(BIAS)
+    assert not r.origin.unshown
     v = judge(r)
     assert v.reasons[0].endswith("what is constant over the log is not judged, and every piece has it")
     assert "25 pieces" in v.reasons[0]
@@ -175,9 +175,9 @@ def test_pieces_are_rows_of_the_log():
 
 def test_the_advised_number_does_not_depend_on_the_size_of_the_errors():
     one = log(np.random.default_rng(1), 4000, 0.5)
-    a, b = (in_pieces(of(scale * np.asarray(one.error))) for scale in (1.0, 7.0))
-    assert a.error.shape == b.error.shape
-    m = memory_of(np.asarray(one.error)[0])
+    a, b = (in_pieces(of(scale * np.asarray(one.errors.error))) for scale in (1.0, 7.0))
+    assert a.errors.error.shape == b.errors.error.shape
+    m = memory_of(np.asarray(one.errors.error)[0])
     assert m.pieces == min(4000 // m.piece, MOST)
     assert m.piece == int(np.ceil(APART * m.upper))
     assert m.time == pytest.approx(3.0, rel=0.35)  # of AR(.5), 1 + 2 (.5 + .25 + ...)
@@ -232,7 +232,7 @@ def test_neighbours_are_tested_by_the_code_of_windows():
     e = rng.standard_normal((1, 8000, N))
     e[0, :4000] *= 0.93
     r = in_pieces(of(e), 40)
-    assert "do not seem to be independent" in r.unshown
+    assert "do not seem to be independent" in r.origin.unshown
     assert judge(r).status == "undecided"
     w = rng.standard_normal((60, N))
     assert independence(w, np.square(w).sum(axis=1)) == independence(w)
@@ -243,11 +243,11 @@ def test_growing_errors_are_refused():
     one = log(np.random.default_rng(7), 2000)
     growing = np.linspace(0.1, 3.0, 2000)[None, :, None, None] * np.eye(N)
     with pytest.raises(cs.InputError, match=r"the stated variance of x grows by x.* over the log.* --relative 10s"):
-        in_pieces(Record("log", one.error, growing, axes=("x", "y")))
+        in_pieces(make_record("log", one.errors.error, growing, axes=("x", "y")))
     outage = np.where(np.arange(2000) >= 1890, 9.0, 1.0)[None, :, None, None] * np.eye(N)
-    assert in_pieces(Record("log", one.error, outage, axes=("x", "y"))).unit == "piece"
+    assert in_pieces(make_record("log", one.errors.error, outage, axes=("x", "y"))).runs.unit == "piece"
     shrinking = growing[:, ::-1]
-    assert in_pieces(Record("log", one.error, shrinking, axes=("x", "y"))).unit == "piece"
+    assert in_pieces(make_record("log", one.errors.error, shrinking, axes=("x", "y"))).runs.unit == "piece"
 
 
 def test_what_is_refused():
@@ -262,10 +262,10 @@ def test_what_is_refused():
 
 def test_steps_before_the_first_covariance_are_in_no_piece():
     one = of(np.random.default_rng(9).standard_normal((1, 1010, N)))
-    P = np.asarray(one.covariance).copy()
+    P = np.asarray(one.errors.covariance).copy()
     P[0, :10] = np.nan
-    r = in_pieces(Record("log", one.error, P), 25)
-    assert_array_equal(r.error.reshape(-1, N), one.error[0, 10:])
+    r = in_pieces(make_record("log", one.errors.error, P), 25)
+    assert_array_equal(r.errors.error.reshape(-1, N), one.errors.error[0, 10:])
 
 
 def test_the_rows_of_the_calibration(monkeypatch):
@@ -297,8 +297,8 @@ def test_options(tmp_path, options, message):
     with pytest.raises(cs.InputError, match=message):
         read_recordings(*files, **options)
     (r,) = read_recordings(*files, split="25")
-    assert r.error.shape == (25, 24, 3)
-    assert any("the log is cut into 25 pieces of 24 steps, treated as runs" in note for note in r.notes)
+    assert r.errors.error.shape == (25, 24, 3)
+    assert any("the log is cut into 25 pieces of 24 steps, treated as runs" in note for note in r.origin.notes)
     auto = cs.judge(cs.read(*files, split="auto"))
     assert auto.status in ("consistent", "undecided")
 
@@ -415,11 +415,11 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng):
     """100 runs that end where the NEES is beyond its 5 % point, certain but for 1e-5; 60 gates of any lengths."""
     nees = runs(rng, 100, 60)
     ended = np.cumsum(nees > stats.chi2.isf(0.05, 3), axis=1) - (nees > stats.chi2.isf(0.05, 3)) > 0
-    verdict = judge(Record("f", nees=np.where(ended, np.nan, nees), dof=3))
+    verdict = judge(make_record("f", nees=np.where(ended, np.nan, nees), dof=3))
     assert verdict.ends.lost
     assert "that end early have a larger NEES in their last step than" in verdict.reasons[1]
     assert verdict.statistics["early_ends"]["lost"]
-    whole = judge(Record("f", nees=nees, dof=3))
+    whole = judge(make_record("f", nees=nees, dof=3))
     assert whole.ends is None
     assert "early_ends" not in whole.statistics
     lost = 0

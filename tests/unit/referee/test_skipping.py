@@ -8,9 +8,10 @@ from command import consistency, refused
 from draws import autoregression, identities, independent, verdict_on
 from numpy.testing import assert_array_equal
 from recorded import read_recordings
+from records import changed
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings
+from consistency.diagnostics import Settings, make_record
 from consistency.referee.diagnostics.judging.fault_location import until
 from consistency.referee.diagnostics.questions.sample import sample_of
 from consistency.referee.diagnostics.questions.scale import simultaneous_band
@@ -86,7 +87,7 @@ def test_the_rest_is_judged_by_its_own_steps(archive, errors):
     assert verdict.statistics["skip"] == "6"
     assert (verdict.statistics["skipped_steps"], verdict.statistics["skipped_runs"]) == (FIRST, 0)
     assert verdict.statistics["left_out_steps"] == []
-    assert np.isfinite(record.nees).all()  # type: ignore[arg-type]
+    assert np.isfinite(record.errors.nees).all()  # type: ignore[arg-type]
 
 
 def test_steps_keep_their_numbers(errors):
@@ -115,23 +116,26 @@ def test_tables_have_times_of_each_run(tmp_path):
     )
     (tmp_path / "truth.csv").write_text(head + "".join(row.format(0) for row in rows))
     (record,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv", state=["a"])
-    assert np.isnan(record.t).all()
+    assert np.isnan(record.runs.t).all()
     rest = record.without_first(Skip(0.35, "s"))
-    assert_array_equal(np.isfinite(rest.nees).sum(axis=1), [6, 7, 8])  # type: ignore[arg-type]
-    assert record.without_first(None).skipped is None
+    assert_array_equal(np.isfinite(rest.errors.nees).sum(axis=1), [6, 7, 8])  # type: ignore[arg-type]
+    assert record.without_first(None).runs.skipped is None
 
 
 def test_windows_count_as_steps_and_by_their_beginning(tmp_path, rng):
     D = np.tile([1.0, 0.0, 0.0], (40, 1))
     np.savez(
-        tmp_path / "m.npz", estimates=D + 0.01 * rng.normal(size=D.shape), truth=np.cumsum(D, axis=0),
-        covariances=np.tile(1e-4 * np.eye(3), (40, 1, 1)), t=0.5 * np.arange(40),
-    )  # fmt: skip
+        tmp_path / "m.npz",
+        estimates=D + 0.01 * rng.normal(size=D.shape),
+        truth=np.cumsum(D, axis=0),
+        covariances=np.tile(1e-4 * np.eye(3), (40, 1, 1)),
+        t=0.5 * np.arange(40),
+    )
     (record,) = read_recordings(tmp_path / "m.npz", relative=3, motions=True)
-    windows = int(np.isfinite(record.nees).sum())  # type: ignore[arg-type]
+    windows = int(np.isfinite(record.errors.nees).sum())  # type: ignore[arg-type]
     for skip, lost in ((Skip(2), 2), (Skip(3.0, "s"), 2), (Skip(3.1, "s"), 3)):
         rest = record.without_first(skip)
-        assert int(np.isfinite(rest.nees).sum()) == windows - lost  # type: ignore[arg-type]
+        assert int(np.isfinite(rest.errors.nees).sum()) == windows - lost  # type: ignore[arg-type]
     verdict = cs.judge(cs.read(tmp_path / "m.npz", relative=3, motions=True), skip=2)
     assert verdict.runs == windows - 2
     assert "without the first 2 steps of each log" in verdict.reasons[0]
@@ -212,17 +216,32 @@ def test_records_of_two_errors():
     P, own = np.full((*shape, 3, 3), 1.0), np.full((*shape, 3, 3), 2.0)
     numbers = np.ones(shape)
     error = np.ones((*shape, 3))
-    c = Record(
-        "f", error, own, numbers, nis=numbers, nis_dof=numbers.astype(np.int64), t=np.arange(1.0, 5.0),
-        convention="left", world=Record("f", error, P, numbers),
-    )  # fmt: skip
+    c = changed(
+        make_record(
+            "f",
+            error,
+            own,
+            numbers,
+            nis=numbers,
+            nis_dof=numbers.astype(np.int64),
+            t=np.arange(1.0, 5.0),
+            convention="left",
+        ),
+        world=make_record("f", error, P, numbers).errors,
+    )
     rest = c.without_first(Skip(2.0, "s"))
     world = rest.in_world
-    for values in (rest.nees, rest.nis, rest.covariance[..., 0, 1], world.nees, world.covariance[..., 2, 2]):
+    for values in (
+        rest.errors.nees,
+        rest.innovations.nis,
+        rest.errors.covariance[..., 0, 1],
+        world.errors.nees,
+        world.errors.covariance[..., 2, 2],
+    ):
         assert_array_equal(np.isnan(values), [[True, True, False, False]] * 2)
-    assert_array_equal(rest.nis_dof, [[0, 0, 1, 1]] * 2)
-    assert rest.nis_dof.dtype == np.int64
-    assert rest.error is world.error is error
+    assert_array_equal(rest.innovations.nis_dof, [[0, 0, 1, 1]] * 2)
+    assert rest.innovations.nis_dof.dtype == np.int64
+    assert rest.errors.error is world.errors.error is error
     assert np.isfinite(P).all()
     with pytest.raises(InputError, match="--skip 4: nothing of f is left"):
         c.without_first(Skip(4))
@@ -284,7 +303,7 @@ def test_first_steps_that_are_right_carry_no_fault(rng):
     """Errors of the first step are 1 but for 3 %, those of the others x1.2; no step leaves the band."""
     error = independent(rng, 200, 60, 3)
     error *= np.sqrt(3.0 * np.r_[0.97, np.full(59, 1.2)] / np.square(error).sum(axis=-1).mean(axis=0))[:, None]
-    sample = sample_of(Record("f", error, identities(error)), Settings())
+    sample = sample_of(make_record("f", error, identities(error)), Settings())
     inside = simultaneous_band(sample.nees / 1.2, 3, SURE)
     assert not inside.outside.any()
     assert until(sample, inside, 1.5) is None
@@ -294,7 +313,7 @@ def test_the_first_steps_hold_the_whole_stretch_of_a_fault(rng):
     """12 steps at fault, in none of which the band is left: the first 8 do not carry it alone."""
     error = independent(rng, 200, 60, 3)
     error[:, :12] *= 3.0
-    sample = sample_of(Record("f", error, identities(error)), Settings())
+    sample = sample_of(make_record("f", error, identities(error)), Settings())
     wide = simultaneous_band(np.full_like(sample.nees, 3.0), 3, SURE)
     assert not wide.outside.any()
     for end, step in ((8, 8), (9, 16), (12, 16), (16, 16)):

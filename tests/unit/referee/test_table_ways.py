@@ -58,8 +58,8 @@ def test_a_table_whose_times_are_dates(name):
         est.append(f"2024-05-01T12:00:{at}Z,{k + 0.5},0.25")
         true.append(f"2024-05-01 14:00:{at}+02:00,{k}")
     record = cs.read(save("est.csv", "\n".join(est)), truth=save("truth.csv", "\n".join(true)), state=["a"])
-    assert_allclose(record.error[0, :, 0], -0.5)
-    assert_allclose(np.diff(record.t), 0.25, atol=1e-6)
+    assert_allclose(record.errors.error[0, :, 0], -0.5)
+    assert_allclose(np.diff(record.runs.t), 0.25, atol=1e-6)
 
 
 def test_a_pose_in_space_and_a_frame_with_dates():
@@ -70,11 +70,11 @@ def test_a_pose_in_space_and_a_frame_with_dates():
     stated = ["time,x,y,z,qx,qy,qz,qw,sigma_x,sigma_y,sigma_z,sigma_roll,sigma_pitch,sigma_yaw"]
     stated += [f"2024-05-01T12:00:0{k}Z,{k + 0.1},0,0,0,0,0,1,1,1,1,1,1,1" for k in range(5)]
     record = cs.read(save("est.csv", "\n".join(stated)), truth=save("truth.csv", rows), time_offset=0.0)
-    assert_allclose(record.error[0, :, 0], -0.1)
+    assert_allclose(record.errors.error[0, :, 0], -0.1)
     t = pd.date_range("2024-05-01", periods=4, freq="s", tz="UTC")
     frame = pd.DataFrame({"t": t, "a": [1.0, 2.0, 3.0, 4.0], "P_a_a": 1.0})
     record = cs.read(frame, truth=frame[["t", "a"]], state=["a"])
-    assert_allclose(record.error, 0.0)
+    assert_allclose(record.errors.error, 0.0)
 
 
 def test_a_date_in_another_column_stays_refused():
@@ -92,17 +92,17 @@ def test_rows_are_paired_by_a_name(name):
     est = save("est.csv", f"{name},a,b,P_a_a,P_a_b,P_b_b\nq.png,2.1,0,1,0,1\np.png,1.2,0,4,0,1\nr.png,3.3,0,1,0,1\n")
     truth = save("truth.csv", f"{name},a,b\np.png,1,0\nq.png,2,0\nr.png,3,0\ns.png,9,9\n")
     record = cs.read(est, truth=truth, state=["a", "b"])
-    assert record.error.shape == (3, 1, 2)
-    assert_allclose(record.error[:, 0, 0], [-0.1, -0.2, -0.3])
-    assert_allclose(record.nees[:, 0], [0.01, 0.01, 0.09])
-    assert any(f"rows are paired by '{name}', and each is a run" in note for note in record.notes)
+    assert record.errors.error.shape == (3, 1, 2)
+    assert_allclose(record.errors.error[:, 0, 0], [-0.1, -0.2, -0.3])
+    assert_allclose(record.errors.nees[:, 0], [0.01, 0.01, 0.09])
+    assert any(f"rows are paired by '{name}', and each is a run" in note for note in record.origin.notes)
 
 
 def test_names_without_a_truth_are_left_out_and_named():
     est = save("est.csv", "image,a,P_a_a\np.png,1.5,1\nx.png,2,1\nq.png,2.5,1\n")
     record = cs.read(est, truth=save("truth.csv", "image,a\nq.png,2\np.png,1\n"), state=["a"])
-    assert_allclose(record.error[:, 0, 0], [-0.5, -0.5])
-    assert any("1 have no truth and are left out (x.png)" in note for note in record.notes)
+    assert_allclose(record.errors.error[:, 0, 0], [-0.5, -0.5])
+    assert any("1 have no truth and are left out (x.png)" in note for note in record.origin.notes)
     with pytest.raises(cs.InputError, match=r"truth\.csv: no 'image' of est\.csv is in it, whose first is 'p\.png'"):
         cs.read(est, truth=save("truth.csv", "image,a\nu.png,2\n"), state=["a"])
 
@@ -113,7 +113,7 @@ def test_names_beside_the_truth_in_one_table_and_for_each_filter():
     path = save("one.csv", "\n".join(rows))
     for kind, shift in (("f", 0.5), ("g", 0.25)):
         record = cs.read(path, state=["a"], filter=kind)
-        assert_allclose(record.error[:, 0, 0], [-shift] * 3)
+        assert_allclose(record.errors.error[:, 0, 0], [-shift] * 3)
 
 
 @pytest.mark.parametrize(
@@ -155,11 +155,11 @@ def test_a_table_without_a_declared_state():
     save("est.csv", "step,px,vx,P_px_px,P_px_vx,P_vx_vx\n" + "".join(f"{k},{k}.1,0.2,.04,.01,.09\n" for k in (1, 2, 3)))
     save("truth.csv", "step,px,vx\n" + "".join(f"{k},{k},0\n" for k in (1, 2, 3)))
     record = cs.read("est.csv", truth="truth.csv")
-    assert record.axes == ("px", "vx")
+    assert record.errors.axes == ("px", "vx")
     e = np.array([0.1, 0.2])
-    assert_allclose(record.nees, e @ np.linalg.inv(P) @ e)
-    assert any("the state is px,vx" in note and "--state" in note for note in record.notes)
-    assert cs.read("est.csv", truth="truth.csv", state=["px"]).axes == ("px",)
+    assert_allclose(record.errors.nees, e @ np.linalg.inv(P) @ e)
+    assert any("the state is px,vx" in note and "--state" in note for note in record.origin.notes)
+    assert cs.read("est.csv", truth="truth.csv", state=["px"]).errors.axes == ("px",)
 
 
 @pytest.mark.parametrize(
@@ -176,12 +176,12 @@ def test_a_covariance_of_the_truth_that_is_not_used_is_named(header, row, noted)
     save("est.csv", "step,a,b,P_a_a,P_a_b,P_b_b\n" + "".join(f"{k},.1,.2,.04,.01,.09\n" for k in (1, 2, 3)))
     save("truth.csv", "\n".join([header, *(row.format(k=k) for k in (1, 2, 3))]))
     record = cs.read("est.csv", truth="truth.csv", state=["a", "b"])
-    said = [note for note in record.notes if "truth.csv: the truth states a covariance of its own" in note]
+    said = [note for note in record.origin.notes if "truth.csv: the truth states a covariance of its own" in note]
     assert bool(said) is noted
     assert all("--truth-covariance columns" in note for note in said)
     if noted and "P_a_b" in header:
         used = cs.read("est.csv", truth="truth.csv", state=["a", "b"], truth_covariance="columns")
-        assert not any("counts as 0" in note for note in used.notes)
+        assert not any("counts as 0" in note for note in used.origin.notes)
 
 
 # --- the truth in the folder of a run --------------------------------------------------------------------
@@ -210,8 +210,8 @@ def test_the_truth_in_the_folder_of_a_run(header, rest, noted, capsys):
     taken = "truth.csv: taken as the truth of the run, as no column of estimates.csv is one; see --truth"
     assert (taken in err) is noted
     record = cs.read("out")
-    assert record.error.shape == (3, 3, 1)
-    assert (np.abs(record.error) < 0.7).all() is np.bool_(noted)
+    assert record.errors.error.shape == (3, 3, 1)
+    assert (np.abs(record.errors.error) < 0.7).all() is np.bool_(noted)
 
 
 # --- arrays of other programs ----------------------------------------------------------------------------
@@ -284,7 +284,7 @@ def test_swapped_runs_and_steps_are_named(shape):
     v = cs.judge(np.swapaxes(e, 0, 1), np.swapaxes(P, 0, 1))
     assert any(hint.search(line) for line in v.reasons)
     np.savez("swapped.npz", errors=np.swapaxes(e, 0, 1), covariances=np.swapaxes(P, 0, 1))
-    assert any(hint.search(note) for note in cs.read("swapped.npz").causes)
+    assert any(hint.search(note) for note in cs.read("swapped.npz").origin.causes)
     for right in (e, correlated(*shape, seed=1, rho=0.0), correlated(*shape, seed=2) + 3.0):
         assert not any(hint.search(line) for line in cs.judge(right, P).reasons)
     grown = e * np.sqrt(np.arange(1, shape[1] + 1))[:, None]  # a walk beside a common path

@@ -206,8 +206,8 @@ def test_innovations_end_with_a_failed_run(rng):
     S[4, 7], v[4, 7, 0] = -1.0, np.nan
     for step, arrays in ((7, {"nis": nis, "nis_dof": 2}), (8, {"innovations": v, "innovation_covariances": S})):
         record = record_of_checked("f", errors, covariances, **arrays)
-        assert np.isnan(record.nis[4]).tolist() == [False] * 6 + [True] * 2
-        assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
+        assert np.isnan(record.innovations.nis[4]).tolist() == [False] * 6 + [True] * 2
+        assert record.innovations.nis_dof[4].tolist() == [2] * 6 + [0] * 2
         with pytest.raises(ConsistencyError, match="1 of"):
             gate(errors, covariances, **arrays)
         with pytest.raises(ConsistencyError, match=rf"first run 4 in step {step}: (NIS|innovation) is not finite"):
@@ -220,8 +220,8 @@ def test_innovations_of_a_start_without_rank(rng):
     S[:, 0] = 0.0
     record = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL)
     assert record.failures == ()
-    assert np.isnan(record.innovations[:, 0]).all()
-    assert np.isfinite(record.innovations[:, 1:]).all()
+    assert np.isnan(record.innovations.values[:, 0]).all()
+    assert np.isfinite(record.innovations.values[:, 1:]).all()
     S[:, 0], S[6, 0] = np.eye(2), 0.0
     failures = record_of_checked("f", innovations=v, innovation_covariances=S, **OPTIMAL).failures
     assert places(failures) == [(6, 1)]
@@ -258,7 +258,7 @@ def test_runs_fail_by_their_innovations(what, reason, rng):
     assert verdict.innovations.ratio == pytest.approx(1.0, abs=0.2)  # of the rest; 6 standard errors
     errors, covariances = spoilt("", rng, 40)
     own = record_of_checked("f", errors, covariances, innovations=v[:, :8], innovation_covariances=S[:, :8])
-    assert np.isnan(own.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
+    assert np.isnan(own.errors.nees).sum(axis=1).tolist() == [2 * (run in (4, 9)) for run in range(40)]
     assert places(own.failures) == [(4, 7), (9, 7)]
 
 
@@ -267,8 +267,8 @@ def test_nis_count_nothing_from_the_failure_of_their_run_on(rng):
     nis[4, 6] = np.nan
     record = record_of_checked("f", nis=nis, nis_dof=2, optimal_gain=True)
     assert places(record.failures) == [(4, 7)]
-    assert record.nis_dof[4].tolist() == [2] * 6 + [0] * 2
-    assert (np.delete(record.nis_dof, 4, axis=0) == 2).all()
+    assert record.innovations.nis_dof[4].tolist() == [2] * 6 + [0] * 2
+    assert (np.delete(record.innovations.nis_dof, 4, axis=0) == 2).all()
 
 
 def test_a_run_fails_where_anything_of_it_failed_first(rng):
@@ -280,8 +280,8 @@ def test_a_run_fails_where_anything_of_it_failed_first(rng):
         (3, 8, True),
         (4, 3, True),
     ]
-    assert np.isfinite(record.error[4]).all(axis=-1).tolist() == [True] * 2 + [False] * 6
-    assert record.nis_dof[[3, 4]].tolist() == [[1] * 7 + [0], [1] * 2 + [0] * 6]
+    assert np.isfinite(record.errors.error[4]).all(axis=-1).tolist() == [True] * 2 + [False] * 6
+    assert record.innovations.nis_dof[[3, 4]].tolist() == [[1] * 7 + [0], [1] * 2 + [0] * 6]
 
 
 def test_misuse_of_innovations_is_no_failed_run(rng):
@@ -300,7 +300,7 @@ def test_misuse_of_innovations_is_no_failed_run(rng):
     known[:, 0] = 0.0  # a start that is known exactly, and a measurement without noise
     record = record_of_checked("f", innovations=v, innovation_covariances=known, optimal_gain=True)
     assert record.failures == ()
-    assert record.nis_dof[0].tolist() == [0] + [2] * 7
+    assert record.innovations.nis_dof[0].tolist() == [0] + [2] * 7
 
 
 def test_misuse_is_no_failed_run(rng):

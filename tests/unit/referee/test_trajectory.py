@@ -5,10 +5,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from painted import by_title, legend_of, lines, panels
 from recorded import read_recordings
+from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Record
+from consistency.diagnostics import make_record
 from consistency.referee.pages.record_figures import MOST, ellipse, overview, record_figures, trajectory_panel, unit_of
 from consistency.referee.show.figures import drawn
 
@@ -27,8 +28,9 @@ def record(convention="so3", axes=("x", "y", "z")):
     nees = np.square(error / sigma)[:, index].sum(axis=1)
     P = np.broadcast_to(np.diag(sigma**2)[np.ix_(index, index)], (1, STEPS, len(axes), len(axes)))
     path = np.stack([true, true - error], axis=1)[None]
-    return Record(
-        "est", error[None][..., index], P, nees[None], len(axes), axes=axes, t=k, convention=convention, path=path
+    return changed(
+        make_record("est", error[None][..., index], P, nees[None], len(axes), axes=axes, t=k, convention=convention),
+        path=path,
     )
 
 
@@ -46,12 +48,12 @@ def test_ellipses_stand_where_the_errors_are_largest():
     axes = axes_of(one)
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_aspect()) == ("x (m)", "z (m)", 1.0)
     truth, estimate, *outlines, crosses = lines(axes)
-    assert_array_equal(truth.get_xydata(), one.path[0, :, 0][:, [0, 2]])
-    assert_array_equal(estimate.get_xydata(), one.path[0, :, 1][:, [0, 2]])
+    assert_array_equal(truth.get_xydata(), one.origin.path[0, :, 0][:, [0, 2]])
+    assert_array_equal(estimate.get_xydata(), one.origin.path[0, :, 1][:, [0, 2]])
     assert len(outlines) == MOST
     worst = outlines[0].get_xydata()[:-1].mean(axis=0)  # about the estimate of step 11, the 10th from 0
-    assert_allclose(worst, one.path[0, 10, 1][[0, 2]], atol=1e-9)
-    assert_allclose(crosses.get_xydata()[0], one.path[0, 10, 0][[0, 2]])
+    assert_allclose(worst, one.origin.path[0, 10, 1][[0, 2]], atol=1e-9)
+    assert_allclose(crosses.get_xydata()[0], one.origin.path[0, 10, 0][[0, 2]])
     assert crosses.get_xdata()[1] == 40.0  # step 12 is beside the first and is not drawn
     assert "errors are largest against it (" in figure(one).caption
     assert set(legend_of(axes.figure)) == {"truth", "estimate", "95 % ellipse", "truth there"}
@@ -79,7 +81,9 @@ def test_only_what_is_judged_is_drawn():
     assert axes_of(record(axes=("x", "y"))).get_ylabel() == "y (m)"
     assert trajectory_panel(record(axes=("z",))) is None
     bare = record()
-    assert trajectory_panel(Record("est", bare.error, bare.covariance, axes=bare.axes)) is None
+    assert (
+        trajectory_panel(make_record("est", bare.errors.error, bare.errors.covariance, axes=bare.errors.axes)) is None
+    )
 
 
 def test_units():
@@ -103,15 +107,15 @@ def write(folder, steps=40):
 
 def test_readers_keep_the_path_for_the_pictures(tmp_path):
     (one,) = read_recordings(*write(tmp_path))
-    assert_allclose(one.path[..., 0, :] - one.path[..., 1, :], one.error[..., :3], atol=1e-12)
+    assert_allclose(one.origin.path[..., 0, :] - one.origin.path[..., 1, :], one.errors.error[..., :3], atol=1e-12)
     v = cs.judge(one)
     titles = [figure.title for figure in record_figures(one, v)]
     assert titles == ["NEES", "Errors over their stated sigma", "Errors and stated bounds", "Trajectory", "Coverage"]
     labels = [line.get_label() for axes in drawn(overview(one, v)).axes for line in axes.lines]
     assert {"truth", "estimate", "all together"} <= set(labels)
-    assert one.of_runs(slice(0, 1)).path is not None
+    assert one.of_runs(slice(0, 1)).origin.path is not None
     (pieces,) = read_recordings(*write(tmp_path), split="20")
-    assert_array_equal(pieces.path.reshape(-1, 2, 3), one.path[0])
+    assert_array_equal(pieces.origin.path.reshape(-1, 2, 3), one.origin.path[0])
 
 
 def test_tables_keep_it_too(tmp_path):
@@ -119,5 +123,5 @@ def test_tables_keep_it_too(tmp_path):
     (tmp_path / "est.csv").write_text("t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n" + rows)
     (tmp_path / "truth.csv").write_text("t,x,y,heading\n" + "".join(f"{k},{k + 1},{2 * k},0.1\n" for k in range(1, 9)))
     (one,) = read_recordings(tmp_path / "est.csv", tmp_path / "truth.csv")
-    assert_array_equal(one.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
+    assert_array_equal(one.origin.path[0, 3], [[5.0, 8.0], [4.0, 8.0]])
     assert trajectory_panel(one) is not None

@@ -1,7 +1,6 @@
 """Truth with a covariance of its own: what is said is about P, and only what its errors allow."""
 
 import json
-from dataclasses import replace
 
 import calibration_truth
 import numpy as np
@@ -11,9 +10,10 @@ from draws import autoregression
 from numpy.testing import assert_allclose, assert_array_equal
 from painted import lines, panels
 from recorded import read_recordings
+from records import changed
 
 import consistency as cs
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.questions.uncertain_truth import (
     contrasts,
     of_both,
@@ -60,7 +60,7 @@ def record(
     e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
     d = e + errors_of_truth(rng, kind, runs, steps) @ np.linalg.cholesky(of_truth).T
     shape = (runs, steps, N, N)
-    return Record(
+    return make_record(
         "est", d, np.broadcast_to(P, shape), axes=("x", "y", "z"), truth_covariance=np.broadcast_to(of_truth, shape),
         truth_errors=errors, truth_shared=shared,
     )  # fmt: skip
@@ -85,7 +85,8 @@ def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherw
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
     rng = np.random.default_rng(5)
     one = record(rng, "common", 0.3, errors="independent")
-    wrong = judge(Record("est", one.error + 1.5, one.covariance, truth_covariance=one.truth_covariance,
+    wrong = judge(make_record("est", one.errors.error + 1.5, one.errors.covariance,
+                           truth_covariance=one.truth.covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
     assert not judge(record(np.random.default_rng(5), "common", 0.3, errors="common")).faults
@@ -96,7 +97,8 @@ def test_a_bias_beyond_the_truth_is_found(errors):
     rng = np.random.default_rng(8)
     one = record(rng, "common", 0.2, errors=errors)
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
-    v = judge(Record("est", one.error + far, one.covariance, axes=one.axes, truth_covariance=one.truth_covariance,
+    v = judge(make_record("est", one.errors.error + far, one.errors.covariance, axes=one.errors.axes,
+                       truth_covariance=one.truth.covariance,
                        truth_errors=errors))  # fmt: skip
     assert v.status == "biased"
     assert {"bias", "bias in some step"} <= set(v.faults)
@@ -139,7 +141,7 @@ def test_a_share_of_an_axis_is_of_that_axis():
 def test_consistent_needs_the_interval_of_the_estimate():
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
     v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
-    plain = judge(Record("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
+    plain = judge(make_record("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
     assert v.equivalence.p_value > plain.equivalence.p_value
     sure = judge(record(np.random.default_rng(1), "white", 0.2, 1.0, "independent", runs=200))
     assert sure.status == "consistent"
@@ -160,8 +162,8 @@ def test_the_interval_of_the_estimate_shows_what_the_tests_show(errors):
 
 
 def _sum(one):
-    assert one.error is not None
-    return one.error, np.asarray(one.covariance) + one.truth_covariance
+    assert one.errors.error is not None
+    return one.errors.error, np.asarray(one.errors.covariance) + one.truth.covariance
 
 
 def test_more_than_half_is_undecided():
@@ -186,13 +188,13 @@ def test_words_name_the_share_and_the_option():
     assert any("20 % of the sum of both (x " in line and "--truth-errors" in line for line in v.reasons)
     declared = judge(record(np.random.default_rng(2), "white", 0.2, errors="per-run"))
     assert any("declared per-run" in line for line in declared.reasons)
-    exact = judge(Record("est", *_sum(record(np.random.default_rng(2), "white", 0.2))))
+    exact = judge(make_record("est", *_sum(record(np.random.default_rng(2), "white", 0.2))))
     assert not any("truth" in line for line in exact.reasons)
 
 
 def test_json_gains_keys_only():
     one = record(np.random.default_rng(2), "white", 0.2, errors="per-run")
-    new, old = judge(one).statistics, judge(Record("est", *_sum(one), axes=one.axes)).statistics
+    new, old = judge(one).statistics, judge(make_record("est", *_sum(one), axes=one.errors.axes)).statistics
     assert set(new) - set(old) == {"truth_share", "truth_share_of_axes", "truth_errors", "truth_shared"}
     assert not set(old) - set(new)
 
@@ -201,8 +203,8 @@ def test_pictures_are_of_both_covariances():
     one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
     v = judge(one)
     drawn = of_both(one)
-    assert_allclose(drawn.nees.mean(axis=0), v.scale.anees)
-    figures = record_figures(replace(one, t=np.arange(float(STEPS)), dof=N), v)
+    assert_allclose(drawn.errors.nees.mean(axis=0), v.scale.anees)
+    figures = record_figures(changed(one, t=np.arange(float(STEPS)), dof=N), v)
     by_title = {figure.title: figure for figure in figures}
     assert {"NEES", "Errors over their stated sigma", "Errors and stated bounds", "Coverage"} < set(by_title)
     assert all(figure.caption.endswith("Covariances are those of estimate and truth together.") for figure in figures)
@@ -282,10 +284,10 @@ def test_a_trajectory_whose_truth_states_its_covariance(tmp_path):
     est, truth, stated = write_tum(tmp_path, 3)
     for source in ("columns", str(stated)):
         (one,) = read_recordings(est, truth, truth_covariance=source, axes=["x", "y", "z"], truth_errors="per-run")
-        assert_allclose(one.truth_covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
-        assert (one.truth_errors, one.truth_shared) == ("per-run", False)
+        assert_allclose(one.truth.covariance, np.broadcast_to(np.eye(3) / 400.0, (3, 40, 3, 3)))
+        assert (one.truth.errors, one.truth.shared) == ("per-run", False)
     (ignored,) = read_recordings(est, truth, axes=["x", "y", "z"])
-    assert ignored.truth_covariance is None
+    assert ignored.truth.covariance is None
     with pytest.raises(cs.InputError, match="holds no file 'r00'"):
         read_recordings(est, truth, truth_covariance=str(tmp_path))
 
@@ -295,7 +297,7 @@ def test_estimates_without_a_covariance_of_the_truth_are_left_out(tmp_path):
     lines = (stated / "r00.txt").read_text().splitlines()
     (stated / "r00.txt").write_text("\n".join(lines[:30]) + "\n")
     (one,) = read_recordings(est, truth, truth_covariance=str(stated), axes=["x", "y", "z"], truth_errors="per-run")
-    assert "est: 10 estimates whose truth has no covariance are left out" in one.notes
+    assert "est: 10 estimates whose truth has no covariance are left out" in one.origin.notes
     v = judge(one)
     assert v.scale.judged_steps == 30
 
@@ -341,7 +343,7 @@ def test_interpolated_truth_has_the_covariance_of_the_nearer_sample(tmp_path):
     (tmp_path / "truth.csv").write_text("t,a,P_a_a\n" + "".join(f"{k},0,{k}\n" for k in range(1, 5)))
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a"], truth_covariance="columns", max_dt=0.5)
-    assert_array_equal(one.truth_covariance[0, :, 0, 0], [1.0, 3.0])
+    assert_array_equal(one.truth.covariance[0, :, 0, 0], [1.0, 3.0])
 
 
 def test_a_table_and_an_archive_state_it(tmp_path):
@@ -354,16 +356,16 @@ def test_a_table_and_an_archive_state_it(tmp_path):
     (tmp_path / "truth.csv").write_text("\n".join(true) + "\n")
     files = tmp_path / "est.csv", tmp_path / "truth.csv"
     (one,) = read_recordings(*files, state=["a", "b"], truth_covariance="columns")
-    assert_array_equal(one.truth_covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
+    assert_array_equal(one.truth.covariance[2, 1], [[3.0, 0.5], [0.5, 3.0]])
     with pytest.raises(cs.InputError, match="for tables it is 'columns'"):
         read_recordings(*files, state=["a", "b"], truth_covariance="other.csv")
     P2 = np.broadcast_to(2.0 * np.eye(2), (3, 2, 2, 2))
-    np.savez(tmp_path / "e.npz", errors=v, covariances=P2, truth_covariances=one.truth_covariance)
+    np.savez(tmp_path / "e.npz", errors=v, covariances=P2, truth_covariances=one.truth.covariance)
     (archive,) = read_recordings(tmp_path / "e.npz", truth_errors="common")
-    assert_array_equal(archive.truth_covariance, one.truth_covariance)
-    assert archive.truth_errors == "common"
-    np.savez(tmp_path / "bad.npz", errors=v, covariances=P2, truth_covariances=-one.truth_covariance)
+    assert_array_equal(archive.truth.covariance, one.truth.covariance)
+    assert archive.truth.errors == "common"
+    np.savez(tmp_path / "bad.npz", errors=v, covariances=P2, truth_covariances=-one.truth.covariance)
     with pytest.raises(cs.InputError, match=r"bad: the covariance of the truth in run 0, step 1 is not a covariance"):
         read_recordings(tmp_path / "bad.npz")
-    in_memory = cs.judge(v, P2, truth_covariances=one.truth_covariance, truth_errors="common")
+    in_memory = cs.judge(v, P2, truth_covariances=one.truth.covariance, truth_errors="common")
     assert in_memory.truth.errors == "common"

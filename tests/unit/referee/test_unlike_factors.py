@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from draws import independent
 from numpy.testing import assert_allclose
+from records import changed
 from scipy import stats
 
-from consistency.diagnostics import Record, Settings, judge
+from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.judging import error_parts
 from consistency.referee.diagnostics.questions.bias_and_shape import pair_p_values
 from consistency.referee.diagnostics.verdict.parts import ComponentRatios, Interval
@@ -40,7 +41,7 @@ def inertial(rng, factors, true=None, runs=40, steps=20):
     scale = np.sqrt(np.repeat(factors, 3))
     P = C / np.outer(scale, scale)
     error = independent(rng, runs, steps, 9) @ np.linalg.cholesky(true).T
-    return Record("f", error, np.broadcast_to(P, (runs, steps, 9, 9)), axes=INERTIAL)
+    return make_record("f", error, np.broadcast_to(P, (runs, steps, 9, 9)), axes=INERTIAL)
 
 
 def p_of_pairs(error, stated):
@@ -146,7 +147,7 @@ def test_axes_of_unlike_factors_are_named_where_the_whole_is_right(rng):
     scale = np.sqrt([2.0, 0.5])
     error = independent(rng, 100, 40, 2) @ np.linalg.cholesky(S).T
     P = np.broadcast_to(S / np.outer(scale, scale), (100, 40, 2, 2))
-    sentence = judge(Record("f", error, P, axes=("x", "y")), Settings(SURE)).reasons[0]
+    sentence = judge(make_record("f", error, P, axes=("x", "y")), Settings(SURE)).reasons[0]
     assert re.search(rf"too small by {WITH_INTERVAL} in x", sentence), sentence
     assert "correlation" not in sentence
     assert "unlike factors" not in sentence  # the sentence on the scale has them
@@ -158,7 +159,7 @@ def opposite_signs(rng):
     true[0, 1] = true[1, 0] = -0.6
     stated[0, 1] = stated[1, 0] = 0.6
     error = independent(rng, 100, 30, 3) @ np.linalg.cholesky(true).T
-    return Record("f", error, np.broadcast_to(stated, (100, 30, 3, 3)), axes=("x", "y", "heading"))
+    return make_record("f", error, np.broadcast_to(stated, (100, 30, 3, 3)), axes=("x", "y", "heading"))
 
 
 def test_a_correlation_is_named_only_if_it_is_shown_to_be_wrong(rng):
@@ -189,7 +190,7 @@ def test_a_wrong_sign_is_named_before_a_correlation_that_is_farther_off(rng):
     true = np.array([[1.0, -0.3, 0.8], [-0.3, 1.0, 0.0], [0.8, 0.0, 1.0]])
     stated = np.array([[1.0, 0.3, 0.0], [0.3, 1.0, 0.0], [0.0, 0.0, 1.0]])
     error = independent(rng, 200, 30, 3) @ np.linalg.cholesky(true).T
-    verdict = judge(Record("f", error, np.broadcast_to(stated, (200, 30, 3, 3))), Settings(SURE))
+    verdict = judge(make_record("f", error, np.broadcast_to(stated, (200, 30, 3, 3))), Settings(SURE))
     assert verdict.shape.pair == (0, 1)
     assert verdict.shape.alone
     assert verdict.status == "inconsistent"
@@ -278,11 +279,11 @@ def test_a_side_is_said_once_and_both_sides_are():
 def test_velocity_is_reported_and_not_tested(rng):
     record = inertial(rng, [1.0, 1.0, 2.0])
     verdict = judge(record, Settings(SURE))
-    block = record.error[..., 6:]
-    nees = np.einsum("rki,ij,rkj->rk", block, np.linalg.inv(record.covariance[0, 0, 6:, 6:]), block)
+    block = record.errors.error[..., 6:]
+    nees = np.einsum("rki,ij,rkj->rk", block, np.linalg.inv(record.errors.covariance[0, 0, 6:, 6:]), block)
     assert verdict.statistics["of_axes"]["velocity"][0] == pytest.approx(nees.mean() / 3.0)
     assert verdict.statistics["groups"]["velocity"] == [6, 7, 8]
-    other = judge(replace(record, axes=(*INERTIAL[:6], "a", "b", "c")), Settings(SURE))
+    other = judge(changed(record, axes=(*INERTIAL[:6], "a", "b", "c")), Settings(SURE))
     assert "velocity" not in other.statistics["of_axes"]
     assert [a.p_value for a in other.answers] == [a.p_value for a in verdict.answers]
     assert other.axes.inflation["x"] == verdict.axes.inflation["x"]
@@ -290,8 +291,8 @@ def test_velocity_is_reported_and_not_tested(rng):
 
 def test_velocity_of_the_estimate_alone_where_the_truth_is_uncertain(rng):
     record = inertial(rng, [1.0, 1.0, 4.0])
-    truth = np.broadcast_to(0.01 * np.eye(9), record.covariance.shape)
-    verdict = judge(replace(record, truth_covariance=truth, truth_errors="independent"), Settings(SURE))
+    truth = np.broadcast_to(0.01 * np.eye(9), record.errors.covariance.shape)
+    verdict = judge(changed(record, truth_covariance=truth, truth_errors="independent"), Settings(SURE))
     plain = judge(record, Settings(SURE)).statistics["of_axes"]["velocity"][0]
     assert verdict.statistics["of_axes"]["velocity"][0] == pytest.approx(plain, rel=0.1)
     assert set(verdict.statistics["truth_share_of_axes"]) == {*INERTIAL, "position", "attitude"}

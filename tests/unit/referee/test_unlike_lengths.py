@@ -13,7 +13,16 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from consistency.diagnostics import Record, Settings, follow, judge, look, sequential_design, speaks, spread_steps
+from consistency.diagnostics import (
+    Settings,
+    follow,
+    judge,
+    look,
+    make_record,
+    sequential_design,
+    speaks,
+    spread_steps,
+)
 from consistency.referee.diagnostics.judging.error_parts import run_tests
 from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
 from consistency.referee.diagnostics.questions.bias_and_shape import mean_shape, products_test
@@ -37,7 +46,7 @@ def diverging(runs=100, steps=60, end=5, every=10, factor=9.0):
     error = np.repeat(rng.standard_normal((runs, 1, 3)), steps, axis=1)
     error[::every] *= np.sqrt(factor)
     error[::every, end:] = np.nan
-    return Record("aborted", error, np.broadcast_to(np.eye(3), (runs, steps, 3, 3)), dof=3)
+    return make_record("aborted", error, np.broadcast_to(np.eye(3), (runs, steps, 3, 3)), dof=3)
 
 
 # --- the tests together --------------------------------------------------------------------------------------
@@ -48,7 +57,7 @@ def test_runs_of_equal_length_have_one_test():
     both = RunMeans(means, np.full(50, 7), 2)
     assert both.find(1.3) == both.name(1.3) == scale_test(means / 1.3, 2, 7)
     assert both.interval(0.9) == ratio_interval(means, 2, 0.9)
-    sample = sample_of(Record("equal", nees=np.random.default_rng(94).chisquare(2, (30, 5)), dof=2), Settings())
+    sample = sample_of(make_record("equal", nees=np.random.default_rng(94).chisquare(2, (30, 5)), dof=2), Settings())
     assert sample.early_means is None
     assert sample.run_means().early is None
     assert run_tests(sample, Settings(), {}).named == {}
@@ -96,7 +105,7 @@ def test_first_steps_are_those_that_nearly_all_runs_have():
     nees[np.arange(30) >= np.arange(10, 110)[:, None]] = np.nan
     nees[:, 4] = np.nan
     nees[50, :8] = np.nan
-    sample = sample_of(Record("ragged", nees=nees, dof=1), Settings())
+    sample = sample_of(make_record("ragged", nees=nees, dof=1), Settings())
     assert sample.first == slice(0, 11)  # the second run of 100 to end has 11 steps
     assert sample.run_means().early.counts.tolist() == [9, *[10] * 49, 3, *[10] * 49]
 
@@ -159,7 +168,7 @@ def test_a_fault_is_named_by_equal_weights_once_it_is_found():
     assert verdict.status == "overconfident"
     assert MAIN in verdict.faults
     assert verdict.scale.inflation.value == verdict.scale.mean_anees / 3
-    ratio = np.square(diverging().error).sum(axis=2)
+    ratio = np.square(diverging().errors.error).sum(axis=2)
     assert verdict.scale.mean_anees == pytest.approx(np.nanmean(ratio, axis=1).mean())
 
 
@@ -192,7 +201,7 @@ def test_what_is_accepted_holds_a_mean_that_is_no_fault():
 
 def test_early_steps_weigh_more_in_bets():
     nees = 2.0 * np.array([[np.nan, 1.0, 2.0, 4.0], [np.nan, 3.0, np.nan, np.nan], [np.nan, np.nan, 5.0, np.nan]])
-    early = sample_of(Record("early", nees=nees, dof=2), Settings()).early_means
+    early = sample_of(make_record("early", nees=nees, dof=2), Settings()).early_means
     total = 1.0 + 1.0 / 2.0 + 1.0 / 3.0
     assert early.shares == pytest.approx([1.0, 1.0 / total, 0.5 / total])
     assert early.means == pytest.approx([(1.0 + 2.0 / 2.0 + 4.0 / 3.0) / total, 3.0, 5.0])

@@ -7,11 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from draws import autoregression, identities, independent, verdict_on
+from records import changed
 from referee import judge
 from scipy import stats
 
 import consistency as cs
-from consistency.diagnostics import Answer, Equivalence, Interval, Record, Settings, Verdict, anees_interval
+from consistency.diagnostics import (
+    Answer,
+    Equivalence,
+    Interval,
+    Settings,
+    Verdict,
+    anees_interval,
+    make_record,
+)
 from consistency.diagnostics import judge as judge_evidence
 from consistency.referee.diagnostics.records.record import Skip, Skipped
 from consistency.referee.diagnostics.verdict import parts
@@ -262,7 +271,7 @@ def test_with_truth_they_are_those_of_the_errors():
     rng = np.random.default_rng(1)
     error = 1.5 * independent(rng, 40, 5, 2)
     nis = {"nis": rng.chisquare(2, (40, 5)), "nis_dof": np.full((40, 5), 2)}
-    verdict = judge_evidence(Record("f", error, identities(error), **nis))
+    verdict = judge_evidence(make_record("f", error, identities(error), **nis))
     nees = np.square(error).sum(axis=-1)
     assert verdict.statistic == pytest.approx(nees.mean())
     assert verdict.threshold == verdict.scale.accepted
@@ -319,14 +328,14 @@ def arrays(*shapes):
 )
 def test_arrays_that_do_not_fit_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        judge_evidence(Record("f", **given))
+        judge_evidence(make_record("f", **given))
 
 
 @pytest.mark.parametrize("index", [[], [2], [-1], [0, 0]])
 def test_subsets_that_do_not_fit_are_refused(index):
     error = np.ones((3, 4, 2))
     with pytest.raises(ValueError, match="subset 'odd'"):
-        judge_evidence(Record("f", error, identities(error)), Settings(subsets={"odd": index}))
+        judge_evidence(make_record("f", error, identities(error)), Settings(subsets={"odd": index}))
 
 
 # --- evidence ------------------------------------------------------------------------------------------
@@ -336,7 +345,7 @@ def test_steps_without_full_rank_are_counted_from_one(rng):
     error, nees = independent(rng, 3, 6, 2), np.ones((3, 6))
     nees[0, :2] = nees[1, 3] = nees[2, 5] = np.nan
     error[2, 5] = np.nan  # a run that has ended
-    evidence = Record("f", error, nees=nees)
+    evidence = make_record("f", error, nees=nees)
     assert evidence.left_out_steps == [1, 2, 4]
-    assert replace(evidence, skipped=Skipped(Skip(1.0), 1)).left_out_steps == [2, 4]
-    assert Record("f", nees=nees, dof=2).left_out_steps == []
+    assert changed(evidence, skipped=Skipped(Skip(1.0), 1)).left_out_steps == [2, 4]
+    assert make_record("f", nees=nees, dof=2).left_out_steps == []

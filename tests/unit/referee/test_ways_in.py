@@ -61,8 +61,8 @@ def write(path, table, **columns):
 
 
 def check(record, data):
-    assert_allclose(record.error[0], data.error, atol=1e-9)
-    assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
+    assert_allclose(record.errors.error[0], data.error, atol=1e-9)
+    assert_allclose(np.asarray(record.errors.covariance[0]), data.P, rtol=1e-9)
 
 
 CLOCKS = {
@@ -86,7 +86,7 @@ def test_a_time_by_another_name_is_t(clock, axes, inside):
     record = cs.read(est, truth=write("truth.csv", data.true(), **names), state=data.state)
     check(record, data)
     start = 1.7e9 if clock == "since 1970" else 0.0
-    assert_allclose(record.t, start + data.t, atol=1e-6)
+    assert_allclose(record.runs.t, start + data.t, atol=1e-6)
     if clock == "time":  # beside t in the other file, and in memory
         check(cs.read(est, truth=write("truth.csv", data.true(), t=data.t), state=data.state), data)
         check(cs.read(pd.read_csv(est), truth=pd.read_csv("truth.csv"), state=data.state), data)
@@ -100,7 +100,7 @@ def test_beside_steps_a_time_is_not_looked_at(inside):
     truth = write("truth.csv", data.true(), step=data.step, time=data.t + 5)
     record = cs.read(est, truth=truth, state=data.state)
     check(record, data)
-    assert np.isnan(record.t).all()
+    assert np.isnan(record.runs.t).all()
     with pytest.raises(cs.InputError, match=r"est\.csv, line 2: column 'time': not a number \(at noon\)"):
         cs.read(est, truth=truth, state=data.state, max_dt=0.1)
     write("est.csv", table, time=data.t)
@@ -128,7 +128,7 @@ def test_a_covariance_by_other_names(spelling, words, axes, inside):
     data = Data(axes)
     record = data.read(data.stated(spelling, axes if words == "own" else tuple(words)))
     check(record, data)
-    assert any(note.startswith("est.csv: read ") and " as P_" in note for note in record.notes)
+    assert any(note.startswith("est.csv: read ") and " as P_" in note for note in record.origin.notes)
 
 
 @pytest.mark.parametrize("spelling", ["cov_{}{}", "P_{}{}"])
@@ -167,8 +167,8 @@ def test_variances_and_deviations_by_other_names(spelling, axes, inside):
     words = ("x", "y", "theta") if axes == POSE else axes
     values = variance if "var" in spelling else np.sqrt(variance)
     record = data.read({spelling.format(word): values[:, i] for i, word in enumerate(words)})
-    assert record.parts == tuple((i,) for i in range(len(axes)))
-    assert_allclose(record.nees[0], (data.error**2 / variance).sum(axis=1), rtol=1e-9)
+    assert record.errors.parts == tuple((i,) for i in range(len(axes)))
+    assert_allclose(record.errors.nees[0], (data.error**2 / variance).sum(axis=1), rtol=1e-9)
 
 
 def test_variances_beside_cross_terms(inside):
@@ -181,7 +181,7 @@ def test_names_that_were_read_before_are_read_so(inside):
     canonical = data.stated("P_{}{}", ("x", "y", "h"))
     check(data.read(canonical | {f"P{i}{j}": 1.0 for i, j in itertools.product("123", repeat=2)}), data)
     deviations = {f"sigma_{axis}": 1.0 for axis in POSE} | {f"var_{axis}": 9.0 for axis in POSE}
-    assert_allclose(data.read(deviations).nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
+    assert_allclose(data.read(deviations).errors.nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
     check(data.read(canonical | {"x_est": 9.0, "theta": 9.0}), data)
     canonical.pop("P_xh")
     with pytest.raises(cs.InputError, match=r"column 'P_xh' is missing; .*--state a,b judges fewer"):
@@ -196,11 +196,11 @@ def test_entries_of_a_covariance_in_space_by_number(spelling, inside):
     true = data.true().drop(columns=["1", "2", "3"])
     est = write("est.csv", own, t=data.t, **turn)
     record = cs.read(est, truth=write("truth.csv", true, t=data.t, **turn))
-    assert_allclose(np.asarray(record.covariance[0]), data.P, rtol=1e-9)
+    assert_allclose(np.asarray(record.errors.covariance[0]), data.P, rtol=1e-9)
     stated = write("est.csv", own, t=data.t, **turn, **{f"sigma_{axis}": 2.0 for axis in data.axes[:3]},
                    sigma_roll=2.0, sigma_pitch=2.0, sigma_yaw=2.0)  # fmt: skip
     deviated = cs.read(stated, truth="truth.csv")  # as before
-    assert_allclose(deviated.nees[0], (data.error[:, :3] ** 2).sum(axis=1) / 4.0, rtol=1e-9)
+    assert_allclose(deviated.errors.nees[0], (data.error[:, :3] ** 2).sum(axis=1) / 4.0, rtol=1e-9)
 
 
 # --- truth beside the estimates ----------------------------------------------------------------------
@@ -218,7 +218,7 @@ def test_truth_and_estimate_in_one_table(true, own, inside):
     table = state.table(state.stated("P{}{}", ("1", "2")), own).join(state.true(true))
     record = cs.read(write("est.csv", table, step=state.step), state=state.state, error="vector")
     check(record, state)
-    assert "est.csv: the truth stands in columns beside the estimates" in record.notes
+    assert "est.csv: the truth stands in columns beside the estimates" in record.origin.notes
 
 
 def in_space(data, stated, true, own="{}"):
@@ -241,11 +241,11 @@ def test_truth_beside_poses_in_space(true, own, folder, inside):
     Path("est").mkdir()
     est = write("est/one.csv", table)
     record = cs.read("est" if folder else est)
-    assert_allclose(record.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)
-    assert any("1 of 7 estimates have no truth" in note for note in record.notes)
-    assert any(note.endswith("the truth stands in columns beside the estimates") for note in record.notes)
+    assert_allclose(record.errors.error[0, :, :3], np.delete(data.error[:, :3], 2, axis=0), atol=1e-9)
+    assert any("1 of 7 estimates have no truth" in note for note in record.origin.notes)
+    assert any(note.endswith("the truth stands in columns beside the estimates") for note in record.origin.notes)
     other = write("truth.csv", data.true().iloc[:, :3], t=data.t, qx=0.0, qy=0.0, qz=0.0, qw=1.0)
-    assert_allclose(cs.read(est, truth=other).error[0, :, :3], data.error[:, :3], atol=1e-9)
+    assert_allclose(cs.read(est, truth=other).errors.error[0, :, :3], data.error[:, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize("spelling", ["var_{}", "{}_var", "sd_{}", "{}_sd"])
@@ -254,11 +254,11 @@ def test_variances_and_deviations_of_poses_in_space(spelling, inside):
     stated = {spelling.format(word): np.full(STEPS, 4.0) for word in words}
     record = cs.read(write("est.csv", in_space(data, stated, "true_{}"), t=data.t), axes=words)
     variance = 4.0 if "var" in spelling else 16.0
-    assert_allclose(np.asarray(record.covariance)[0, 3], variance * np.eye(6))
-    assert record.parts == tuple((i,) for i in range(6))
+    assert_allclose(np.asarray(record.errors.covariance)[0, 3], variance * np.eye(6))
+    assert record.errors.parts == tuple((i,) for i in range(6))
     other = {f"var_{word}": 9.0 for word in words} | {f"sd_{word}": np.full(STEPS, 2.0) for word in words}
     both = cs.read(write("est.csv", in_space(data, other, "true_{}"), t=data.t), axes=words)  # as in the plane
-    assert_allclose(np.asarray(both.covariance)[0, 3], 4.0 * np.eye(6))
+    assert_allclose(np.asarray(both.errors.covariance)[0, 3], 4.0 * np.eye(6))
 
 
 def test_rows_without_a_truth_beside_them_do_not_count(inside):
@@ -268,10 +268,10 @@ def test_rows_without_a_truth_beside_them_do_not_count(inside):
     two = pd.concat([table.assign(filter="one"), table.assign(filter="two", true_a=table["true_a"] + 1.0)])
     one, two_ = read_recordings(write("est.csv", two), state=data.state)
     expected = np.delete(data.error, 3, axis=0)
-    assert_allclose(one.error[0], expected, atol=1e-9)
-    assert_allclose(two_.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)
+    assert_allclose(one.errors.error[0], expected, atol=1e-9)
+    assert_allclose(two_.errors.error[0], expected + np.array([1.0, 0.0]), atol=1e-9)
     other = write("truth.csv", data.true() + 2.0, step=data.step)  # a truth that is named counts
-    assert_allclose(cs.read("est.csv", other, state=data.state, filter="one").error[0], data.error + 2.0)
+    assert_allclose(cs.read("est.csv", other, state=data.state, filter="one").errors.error[0], data.error + 2.0)
     with pytest.raises(cs.InputError, match="column 'true_b' is missing"):
         cs.read(write("est.csv", table.drop(columns="true_b")), state=data.state)
 
@@ -343,9 +343,12 @@ def test_files_of_matlab_are_archives(n, inside):
     savemat("est.mat", flat | {"axes": names, "lengths": np.array([5, 4, 5, 3])})
     np.savez("est.npz", **given, axes=[*names], lengths=[5, 4, 5, 3])
     own, npz = cs.read("est.mat"), cs.read("est.npz")
-    for key in ("error", "covariance", "nees", "nis", "nis_dof", "t"):
-        assert_array_equal(getattr(own, key), getattr(npz, key))
-    assert own.axes == npz.axes
+    for value, key in (
+        ("errors", "error"), ("errors", "covariance"), ("errors", "nees"), ("innovations", "nis"),
+        ("innovations", "nis_dof"), ("runs", "t"),
+    ):  # fmt: skip
+        assert_array_equal(getattr(getattr(own, value), key), getattr(getattr(npz, value), key))
+    assert own.errors.axes == npz.errors.axes
     from consistency.referee.readers.formats.innovation_files import read_nis
 
     assert_array_equal(read_nis(Path("est.mat"), run=1).nis, read_nis(Path("est.npz"), run=1).nis)
@@ -356,13 +359,13 @@ def test_what_a_file_of_matlab_may_hold(inside):
     nees = rng.chisquare(3, (6, 4))
     savemat("nees.mat", {"nees": nees, "dof": 3.0, "mask": (nees > 100).astype("uint8")})
     record = cs.read("nees.mat")
-    assert_array_equal(record.nees, nees)
-    assert record.dof == 3
+    assert_array_equal(record.errors.nees, nees)
+    assert record.errors.dof == 3
     savemat("one.mat", {"errors": np.ones((6, 1)), "covariances": np.ones((6, 1))})  # six runs, or six steps?
     with pytest.raises(cs.InputError, match=r"'covariances' has shape \(6, 1\): one run of one component has \(1, st"):
         cs.read("one.mat")
     savemat("one.mat", {"errors": np.ones((1, 6)), "covariances": np.ones((1, 6))})
-    assert cs.read("one.mat").error.shape == (1, 6, 1)
+    assert cs.read("one.mat").errors.error.shape == (1, 6, 1)
     Path("new.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(600))
     with pytest.raises(cs.InputError, match=r"new\.mat: is of MATLAB 7\.3; write it with save\(\.\.\., '-v7'\)"):
         cs.read("new.mat")
@@ -423,8 +426,8 @@ def test_nees_with_degrees_of_freedom_by_step(inside):
     for shape in ((50, 60), (60,)):
         np.savez("nees.npz", nees=nees, dof=np.broadcast_to(dof, shape))
         record = cs.read("nees.npz")
-        assert record.dof == 3
-        assert_allclose(record.nees, 3.0 * nees / dof)
+        assert record.errors.dof == 3
+        assert_allclose(record.errors.nees, 3.0 * nees / dof)
     assert any("its distribution is not judged" in text for text in cs.judge(record).reasons)
     with pytest.raises(AssertionError, match=r"overconfident: covariance too small by x1\.[45678]"):
         assert_consistent(nees=1.6 * nees, dof=dof)
@@ -465,8 +468,8 @@ def test_motions_of_stretches_of_other_lengths_are_no_broken_filters(inside):
             Path(folder).mkdir(exist_ok=True)
             np.savetxt(f"{folder}/{name}.tum", values, fmt="%.17g")
     record = cs.read("est", truth="truth", relative=1, motions=True)
-    assert np.isfinite(record.error).all(axis=-1).sum() == 8 + 4
-    assert not any("broke down" in note for note in record.notes)
+    assert np.isfinite(record.errors.error).all(axis=-1).sum() == 8 + 4
+    assert not any("broke down" in note for note in record.origin.notes)
 
 
 # --- chains of frames --------------------------------------------------------------------------------
@@ -496,10 +499,10 @@ def test_a_chain_of_frames_is_composed(tmp_path):
     total = turned * base * mast
     expected, total = expected[both], total[both]
     [record] = read_recordings(bag, truth_topic="map:mast")  # the estimates are at the origin
-    assert_allclose(record.error[0, :, :3], expected, atol=1e-6)
-    assert_allclose(Rotation.from_rotvec(record.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)
+    assert_allclose(record.errors.error[0, :, :3], expected, atol=1e-6)
+    assert_allclose(Rotation.from_rotvec(record.errors.error[0, :, 3:]).as_matrix(), total.as_matrix(), atol=1e-9)
     [back] = read_recordings(bag, truth_topic="mast:map")
-    assert_allclose(back.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)
+    assert_allclose(back.errors.error[0, :, :3], -total.inv().apply(expected), atol=1e-6)
     with pytest.raises(
         cs.InputError, match=r"map:arm: is not a transform of /tf; .*base:mast, map:odom, odom:base, world"
     ):
@@ -513,9 +516,9 @@ def test_zeros_are_no_covariance_of_the_truth(tmp_path):
     t = 1000.0 + np.arange(5.0)
     bag = write_frames(tmp_path / "bag", [], t, odometry=0.0)
     [record] = read_recordings(bag, topic="/pose", truth_topic="/odom")
-    assert not any("covariance of its own" in note for note in record.notes)
+    assert not any("covariance of its own" in note for note in record.origin.notes)
     with pytest.raises(cs.InputError, match="--truth-covariance columns: the messages of /odom state none"):
         read_recordings(bag, topic="/pose", truth_topic="/odom", truth_covariance="columns")
     stated = write_frames(tmp_path / "other", [], t, odometry=0.1)
     [record] = read_recordings(stated, topic="/pose", truth_topic="/odom")
-    assert any("the truth states a covariance of its own" in note for note in record.notes)
+    assert any("the truth states a covariance of its own" in note for note in record.origin.notes)

@@ -134,7 +134,7 @@ def test_a_dark_frame_is_bridged(wall, tmp_path):
     (recording,) = read_recordings(
         tmp_path / "log/trajectory.tum", tmp_path / "log/truth.tum", tmp_path / "log/covariance.txt", "so3"
     )
-    assert np.isfinite(recording.nees[0]).all()
+    assert np.isfinite(recording.errors.nees[0]).all()
 
 
 # --- tracks and trajectories ---------------------------------------------------------------------

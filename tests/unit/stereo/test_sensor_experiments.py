@@ -86,7 +86,7 @@ def test_so_many_features_from_here_to_there(issues):
 def test_statistics_of_runs(issues):
     error = np.zeros((2, 4, 3))
     error[0, :, :2], error[0, :, 2], error[1, :, :2], error[1, :, 2] = [3.0, 4.0], 1.0, 1.0, 0.5
-    record = cs.Record("f", error, nees=np.array([[2.0, np.nan], [4.0, 6.0]]))
+    record = cs.make_record("f", error, nees=np.array([[2.0, np.nan], [4.0, 6.0]]))
     assert issues.log_rmse(record, (0, 1))[0] == pytest.approx(np.log(5.0))
     assert issues.log_rmse(record, (2,))[1] == pytest.approx(np.log(0.5))
     assert issues.log_nees(record) == pytest.approx(np.log([2.0, 5.0]))
@@ -100,7 +100,7 @@ def test_errors_of_the_first_run(issues):
     covariance[0, 1, 0, 0] = np.nan
     error = np.zeros((2, 2, 3))
     error[0, 1] = 1.0, 2.0, np.radians(3.0)
-    table = issues.first_run(cs.Record("f", error, covariance))
+    table = issues.first_run(cs.make_record("f", error, covariance))
     expected = [[1, 0, 0, 0, 2, 3, 5], [2, 1, 2, 3, np.nan, 3, 5]]
     assert_allclose(table.to_numpy(float), expected)
     assert table.columns.tolist() == ["step", "x", "y", "heading", "sigma_x", "sigma_y", "sigma_heading"]

@@ -81,7 +81,7 @@ def _without_far_runs(track: Track, scale: Scale) -> tuple[Array | None, int]:
     """ANEES (T,) without the runs that are far from the median run, and how many those are."""
     if not scale.worst_run > SPREAD * scale.median_run:
         return None, 0
-    nees = track.record().first_runs(track.verdict.runs).nees
+    nees = track.record().first_runs(track.verdict.runs).errors.nees
     assert nees is not None
     means, _ = run_means(nees)
     far = means > SPREAD * scale.median_run

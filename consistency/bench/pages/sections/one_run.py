@@ -160,13 +160,13 @@ def _draw_errors(study: Study, of: PoseError) -> Drawing:
 def pose_error_series(track: Track) -> PoseError | None:
     """Errors of the shown run; None where they are not known."""
     run = track.shown.in_world
-    if run.error is None or run.covariance is None:
+    if run.errors.error is None or run.errors.covariance is None:
         return None
-    if not len(run.error):
-        empty = np.full((len(run.t), 3), np.nan)
+    if not len(run.errors.error):
+        empty = np.full((len(run.runs.t), 3), np.nan)
         return PoseError(track, empty, empty)
-    variance = np.diagonal(run.covariance[0], axis1=-2, axis2=-1)
-    return PoseError(track, DEGREES * run.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
+    variance = np.diagonal(run.errors.covariance[0], axis1=-2, axis2=-1)
+    return PoseError(track, DEGREES * run.errors.error[0], DEGREES * np.sqrt(np.maximum(variance, 0.0)))
 
 
 def errors_caption(study: Study) -> str:

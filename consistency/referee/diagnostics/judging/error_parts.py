@@ -100,7 +100,7 @@ def error_parts(
     """All parts of the errors of a sample; those of NEES alone have no components."""
     faults = set(faults_of(given))
     band = _band_of_fault(sample, tests, faults, settings)
-    location = location_of(sample, band, faults, ordered=record.landmarks is None, detect=settings.factor)
+    location = location_of(sample, band, faults, ordered=record.map.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown, faults)
     tails = tails_of(tests, record.run_numbers)
@@ -240,7 +240,7 @@ def by_group_of(
     there = sum(len(one.means) > 0 for one in found)
     is_asked = any(answer.question == GROUP for answer in given)
     is_found = GROUP in faults_of(given)
-    both_sides = replace(settings, allow=None) if record.reduced else settings
+    both_sides = replace(settings, allow=None) if record.fit.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
     from consistency.referee.diagnostics.records.groups import spans_of

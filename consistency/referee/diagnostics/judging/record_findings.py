@@ -41,7 +41,7 @@ from consistency.referee.diagnostics.questions.scale import (
     worst,
 )
 from consistency.referee.diagnostics.questions.tails import early_ends, lost_of
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.records.record import Errors, InnovationRecord, Record
 from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
 from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
@@ -111,7 +111,7 @@ def findings_of(
     """
     runs, steps = runs_and_steps(record)
     both_sides = settings
-    if record.reduced:
+    if record.fit.reduced:
         settings = replace(settings, allow="conservative")
     innovations, p_values = _innovations(record, settings)
     joint = _joint(record, settings)
@@ -129,7 +129,7 @@ def findings_of(
         if truth is not None:
             asked = truth.p_values(asked, settings)
         if not unshown:
-            p_values |= {question: p for question, p in asked.items() if question not in record.unavailable}
+            p_values |= {question: p for question, p in asked.items() if question not in record.fit.unavailable}
         if truth is None or not truth.bounded:
             named = dict(tests.named)
     if inspection is not None:
@@ -150,7 +150,7 @@ def findings_of(
         scale_equivalence = _equivalence(sample, both_sides, inspection, record, truth)
         parts = error_parts(record, sample, tests, given_answers, settings, scale_equivalence)
         lost = lost_of(record, sample.nees, sample.dof, settings, any_time=inspection is not None)
-        if record.landmarks is None:
+        if record.map.landmarks is None:
             ends = _early_ends(sample)
         if sample.whitened is not None:
             impossible = _impossible(record, sample)
@@ -188,14 +188,14 @@ def findings_of(
         left_out_steps=tuple(left_out_steps),
         **parts._replace(scale=scale)._asdict(),
         innovations=innovations,
-        landmarks=record.landmarks,
+        landmarks=record.map.landmarks,
         joint=None if joint is None else joint.score,
-        times=record.t if record.files and len(record.t) == steps else None,
-        files=record.files if len({*record.files.values()}) > 1 else {},
-        unit=record.unit,
+        times=record.runs.t if record.origin.files and len(record.runs.t) == steps else None,
+        files=record.origin.files if len({*record.origin.files.values()}) > 1 else {},
+        unit=record.runs.unit,
         lost=lost,
         ends=ends,
-        skipped=record.skipped,
+        skipped=record.runs.skipped,
         truth=share,
         unshown=unshown,
         later=later,
@@ -207,7 +207,7 @@ def findings_of(
 
 def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None, dict[str, float]]:
     """What the innovations say, and the p values of their questions where an optimal gain is declared."""
-    if record.nis is None and record.innovations is None:
+    if record.innovations.nis is None and record.innovations.values is None:
         return None, {}
     from consistency.referee.diagnostics.questions.whiteness import (
         nis_and_dof,
@@ -225,12 +225,12 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
     interval = UNKNOWN_ENDS
     if test.dof:
         interval = chi2_mean_interval(test.dof, CONFIDENCE)
-    if record.innovations is not None and record.innovation_covariances is not None:
-        white = whiteness(record.innovations, record.innovation_covariances)
+    if record.innovations.values is not None and record.innovations.covariances is not None:
+        white = whiteness(record.innovations.values, record.innovations.covariances)
     else:
         white = nis_whiteness(nis, dof)
-    said = Innovations(test.ratio, interval, test.dof, record.optimal_gain, white.correlation, white.bound)
-    if not record.optimal_gain:
+    said = Innovations(test.ratio, interval, test.dof, record.innovations.optimal_gain, white.correlation, white.bound)
+    if not record.innovations.optimal_gain:
         return said, {}
     factor = max(settings.factor, settings.tolerated)
     shown = equivalence_of_total(test.ratio * test.dof, test.dof, settings, factor)
@@ -247,11 +247,11 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
 
 
 def _joint(record: Record, settings: Settings) -> JointTest | None:
-    if record.joint is None:
+    if record.map.joint is None:
         return None
     from consistency.referee.diagnostics.questions.maps import joint_test
 
-    return joint_test(record.joint, settings, record.run_numbers, record.landmarks)
+    return joint_test(record.map.joint, settings, record.run_numbers, record.map.landmarks)
 
 
 def _tolerated(joint: JointTest | None, innovations: Innovations | None, settings: Settings) -> set[str]:
@@ -284,8 +284,8 @@ def _equivalence(
         sample.longest,
         settings,
         factor,
-        low_is_fault=not record.reduced,
-        unseen=record.unseen,
+        low_is_fault=not record.fit.reduced,
+        unseen=record.fit.unseen,
         is_whole=True,
         test=partial(sample.run_means().find, gaussian=False),
     )
@@ -308,7 +308,7 @@ def _impossible(record: Record, sample: Sample) -> list[tuple[int, int]]:
 
 def _left_out_steps(record: Record, sample: Sample) -> list[int]:
     """Steps (1..T) in which the covariance of some run is stated and of no full rank."""
-    stated = every_entry(np.isfinite, np.asarray(record.covariance, float))
+    stated = every_entry(np.isfinite, np.asarray(record.errors.covariance, float))
     return [int(k) + 1 for k in np.flatnonzero((stated & ~sample.counted).any(axis=0))]
 
 
@@ -358,9 +358,15 @@ def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> 
         As :func:`consistency.diagnostics.judge`.
     """
     if unshown:
-        record = replace(record, unavailable=tuple(SHARES))
+        record = replace(record, fit=replace(record.fit, unavailable=tuple(SHARES)))
     parts = _by_holm(_records_of_parts(record), settings)
-    whole = findings_of(replace(record, parts=(), unavailable=tuple(SHARES), optimal_gain=False), settings)
+    undivided = replace(
+        record,
+        errors=replace(record.errors, parts=()),
+        innovations=replace(record.innovations, optimal_gain=False),
+        fit=replace(record.fit, unavailable=tuple(SHARES)),
+    )
+    whole = findings_of(undivided, settings)
     nees = _nees_over_n(record)
     lost = lost_of(record, nees, 1, settings)  # a mean of chi-square(1), however they depend on each other
     innovations = whole.innovations
@@ -394,27 +400,24 @@ def findings_of_parts(record: Record, settings: Settings, unshown: str = "") -> 
 def _records_of_parts(record: Record) -> dict[str, Record]:
     """A record of the errors of each part, and one of the innovations if they are judged."""
     names = names_of(record)
-    axes = record.axes or names
-    assert record.error is not None
-    covariance = np.asarray(record.covariance, float)
+    axes = record.errors.axes or names
+    assert record.errors.error is not None
+    covariance = np.asarray(record.errors.covariance, float)
     records = {}
-    for index in record.parts:
+    for index in record.errors.parts:
         some = list(index)
-        records[", ".join(names[i] for i in index)] = replace(
-            record,
-            error=record.error[..., some],
+        errors = replace(
+            record.errors,
+            error=record.errors.error[..., some],
             covariance=covariance[..., some, :][..., some],
             dof=len(some),
             axes=tuple(axes[i] for i in index),
             parts=(),
-            nis=None,
-            nis_dof=None,
-            innovations=None,
-            innovation_covariances=None,
-            optimal_gain=False,
         )
-    if record.optimal_gain and record.nis is not None:
-        records[INNOVATIONS] = replace(record, error=None, covariance=None, nees=None, dof=0, parts=())
+        records[", ".join(names[i] for i in index)] = replace(record, errors=errors, innovations=InnovationRecord())
+    if record.innovations.optimal_gain and record.innovations.nis is not None:
+        errors = Errors(axes=record.errors.axes, own_names=record.errors.own_names)
+        records[INNOVATIONS] = replace(record, errors=errors)
     return records
 
 
@@ -435,12 +438,12 @@ def _by_holm(records: Mapping[str, Record], settings: Settings) -> dict[str, Fin
 
 def _nees_over_n(record: Record) -> Array:
     """NEES by the stated variances over the number of components, (runs, steps); NaN where it does not count."""
-    assert record.error is not None
-    assert record.covariance is not None
-    nees = squared_length(whiten(record.error, record.covariance)) / record.error.shape[-1]
+    assert record.errors.error is not None
+    assert record.errors.covariance is not None
+    nees = squared_length(whiten(record.errors.error, record.errors.covariance)) / record.errors.error.shape[-1]
     counted = np.isfinite(nees)
-    if record.nees is not None:
-        counted = np.isfinite(record.nees)
+    if record.errors.nees is not None:
+        counted = np.isfinite(record.errors.nees)
     return np.where(counted, nees, np.nan)
 
 
@@ -450,7 +453,7 @@ def _scale_of_whole(whole: Scale, parts: Mapping[str, Findings], record: Record,
     means, counts = run_means(nees)
     inflation = whole.inflation
     if counts.astype(bool).sum() < FEW:  # the errors of all parts may be the same
-        inflation = ratio_interval(means[counts > 0], min(map(len, record.parts)))
+        inflation = ratio_interval(means[counts > 0], min(map(len, record.errors.parts)))
     return replace(
         whole,
         inflation=inflation,

@@ -45,9 +45,9 @@ def map_score(run: Indices, nees: Array, dof: int = POINT, verdict: Verdict | No
 
 def last_nees(record: Record) -> Array | None:
     """The last NEES that each run has, (runs,), NaN where it has none; None without NEES."""
-    if record.nees is None:
+    if record.errors.nees is None:
         return None
-    return by_runs(_last_of_runs, record.nees)
+    return by_runs(_last_of_runs, record.errors.nees)
 
 
 def _last_of_runs(nees: Array) -> Array:

@@ -14,7 +14,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, deciding_runs, run_means, scale_test
-from consistency.referee.diagnostics.records.record import Record, arrays_of, numbered_axes
+from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.diagnostics.statistics.number_of_runs import (
@@ -281,12 +281,12 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
     InputError
         There is more than one run, no error, or a stated variance grows over the log.
     """
-    if record.error is None or record.covariance is None or len(record.error) != 1:
+    if record.errors.error is None or record.errors.covariance is None or len(record.errors.error) != 1:
         raise InputError(f"--split: needs the errors of one log; {record.name} has {len(record.run_numbers)} runs")
     if record.failures:
         raise InputError(f"--split: {record.name} failed in step {record.failures[0].step}; cut the log before that")
-    P = np.asarray(record.covariance, float)
-    whitened = whiten(record.error, P)[0]
+    P = np.asarray(record.errors.covariance, float)
+    whitened = whiten(record.errors.error, P)[0]
     whitened_steps = np.flatnonzero(np.isfinite(whitened).all(axis=1))
     if not len(whitened_steps):
         raise InputError(f"--split: {record.name} has no step that can be judged")
@@ -301,28 +301,29 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         raise InputError(f"--split {pieces}: {record.name} has only {memory.steps} steps")
     end = log.start + pieces * length
     whitened_pieces = whitened[log.start : end].reshape(pieces, length, -1)
-    arrays = {
-        name: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
-        for name, array in arrays_of(record).items()
-        if name not in ("covariance", "times", "truth_covariance")
-    }
-    clock = record.t
+    clock = record.runs.t
     times = None
-    if record.times is not None:
-        clock = record.times[0]
+    if record.runs.times is not None:
+        clock = record.runs.times[0]
     if len(clock):
         times = clock[log.start : end].reshape(pieces, length)
     note = (
         f"{record.name}: the log is cut into {pieces} pieces of {length} steps, treated as runs; its errors last "
         f"over {memory.time:.3g} steps"
     )
+    runs = replace(record.runs, numbers=None, times=None)
+    of_pieces = replace(record, runs=runs, truth=replace(record.truth, covariance=None)).changed(
+        lambda array: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
+    )
     return replace(
-        record, **arrays, covariance=P[0, log.start : end].reshape(pieces, length, *P.shape[2:]), times=times,
-        groups=None if record.groups is None else record.groups.in_pieces(slice(log.start, end), pieces),
-        t=np.full(length, np.nan), runs=np.arange(1, pieces + 1), unit="piece", caption=CAPTION,
-        notes=(*record.notes, note),
-        unavailable=BIAS, unshown=_unshown(memory, pieces, length, whitened_pieces),
-    )  # fmt: skip
+        of_pieces,
+        runs=replace(
+            of_pieces.runs, numbers=np.arange(1, pieces + 1), unit="piece", times=times, t=np.full(length, np.nan)
+        ),
+        truth=record.truth,
+        fit=replace(record.fit, caption=CAPTION, unavailable=BIAS),
+        origin=replace(of_pieces.origin, unshown=_unshown(memory, pieces, length, whitened_pieces)),
+    ).with_notes(note)
 
 
 def _require_steady(record: Record, P: Array) -> None:
@@ -331,7 +332,7 @@ def _require_steady(record: Record, P: Array) -> None:
     if min(map(len, blocks)) == 0:
         return
     medians = np.array([np.nanmedian(block, axis=0) for block in blocks])
-    names = record.names or numbered_axes(medians.shape[1])
+    names = record.errors.names or numbered_axes(medians.shape[1])
     for axis, values in zip(names, medians.T, strict=True):
         ratio = float(values[-1] / max(values[1], np.finfo(float).tiny))
         signs = np.sign(values[None, :] - values[:, None])[np.triu_indices(len(values), 1)]

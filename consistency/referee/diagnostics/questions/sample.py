@@ -77,13 +77,13 @@ class Sample:
     @property
     def error(self) -> Array:
         """(N, T, n), of a sample with errors."""
-        assert self.record.error is not None
-        return self.record.error
+        assert self.record.errors.error is not None
+        return self.record.errors.error
 
     @property
     def covariance(self) -> Array:
         """(N, T, n, n), of a sample with errors."""
-        return np.asarray(self.record.covariance, float)
+        return np.asarray(self.record.errors.covariance, float)
 
     @property
     def reported(self) -> dict[str, list[int]]:
@@ -96,7 +96,7 @@ class Sample:
 
     def members(self, axes: Collection[str]) -> list[int]:
         """Places of components that are some of the ``axes``, whatever the user calls them."""
-        return [i for i, axis in enumerate(self.record.axes) if axis in axes]
+        return [i for i, axis in enumerate(self.record.errors.axes) if axis in axes]
 
     @property
     def groups(self) -> Groups | None:
@@ -215,22 +215,22 @@ def sample_of(record: Record, settings: Settings) -> Sample | None:
     ValueError
         Names or subsets that do not fit, or NEES without dof.
     """
-    if record.error is None or record.covariance is None:
-        if record.nees is None:
+    if record.errors.error is None or record.errors.covariance is None:
+        if record.errors.nees is None:
             return None
-        if not record.dof:
+        if not record.errors.dof:
             raise ValueError("nees needs dof, the dimension of the error")
-        return Sample(record, record.nees, record.dof)
+        return Sample(record, record.errors.nees, record.errors.dof)
     names = names_of(record)
-    error = record.error
-    P = np.asarray(record.covariance, float)
+    error = record.errors.error
+    P = np.asarray(record.errors.covariance, float)
     whitened = np.empty(error.shape)
     nees = np.empty(error.shape[:2])
     for here in of_runs(nees):
         w = whiten(error[here], P[here])
         counted = all_finite(w)
-        if record.nees is not None:
-            counted = np.isfinite(record.nees[here])
+        if record.errors.nees is not None:
+            counted = np.isfinite(record.errors.nees[here])
         nees[here] = np.where(counted, squared_length(w), np.nan)
         w[~np.isfinite(nees[here])] = np.nan
         whitened[here] = w
@@ -246,13 +246,13 @@ def names_of(record: Record) -> tuple[str, ...]:
     ValueError
         Other than one name for each component.
     """
-    assert record.error is not None
-    n = record.error.shape[-1]
-    if record.axes is None or not len(record.axes):
+    assert record.errors.error is not None
+    n = record.errors.error.shape[-1]
+    if record.errors.axes is None or not len(record.errors.axes):
         return numbered_axes(n)
-    if len(record.axes) != n:
-        raise ValueError(f"{len(record.axes)} names of axes for {n} components")
-    return record.names
+    if len(record.errors.axes) != n:
+        raise ValueError(f"{len(record.errors.axes)} names of axes for {n} components")
+    return record.errors.names
 
 
 def component_groups(sample: Sample, subsets: Mapping[str, Sequence[int]] | None) -> dict[str, list[int]]:
@@ -280,11 +280,15 @@ def runs_and_steps(record: Record) -> tuple[int, int]:
         They do not agree, or nothing is there.
     """
     dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
-    shapes = {}
-    for name in dimensions:
-        array = getattr(record, name)
-        if array is not None:
-            shapes[name] = np.shape(array)
+    arrays = {
+        "error": record.errors.error,
+        "covariance": record.errors.covariance,
+        "nees": record.errors.nees,
+        "nis": record.innovations.nis,
+        "nis_dof": record.innovations.nis_dof,
+        "innovations": record.innovations.values,
+    }
+    shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
     if not set(shapes) - {"covariance", "nis_dof"}:
         raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     for name, shape in shapes.items():
@@ -308,5 +312,5 @@ def impossible_values(record: Record, counted: Array) -> Array:
         odd[suspect] = negative(P[suspect])
         return odd
 
-    assert record.error is not None
-    return by_runs(of_block, record.error, np.asarray(record.covariance, float), counted)
+    assert record.errors.error is not None
+    return by_runs(of_block, record.errors.error, np.asarray(record.errors.covariance, float), counted)

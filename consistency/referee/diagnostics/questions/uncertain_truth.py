@@ -72,42 +72,43 @@ class UncertainTruth:
     def bounded(self) -> bool:
         """Whether only what holds under any dependence can be said."""
         r = self.record
-        return r.truth_shared or r.truth_errors is None or (r.truth_errors == "common" and len(r.run_numbers) < 2)
+        return r.truth.shared or r.truth.errors is None or (r.truth.errors == "common" and len(r.run_numbers) < 2)
 
     @property
     def _together(self) -> float:
         """Factor by which both covariances grow if e and v may depend on each other."""
-        if self.record.truth_shared:
+        if self.record.truth.shared:
             return SHARED
         return 1.0
 
     @property
     def contrasted(self) -> bool:
-        return self.record.truth_errors == "common" and not self.bounded
+        return self.record.truth.errors == "common" and not self.bounded
 
     @cached_property
     def P(self) -> Array:
-        return np.asarray(self.record.covariance, float)
+        return np.asarray(self.record.errors.covariance, float)
 
     @cached_property
     def P_t(self) -> Array:
-        assert self.record.truth_covariance is not None
-        return np.asarray(self.record.truth_covariance, float)
+        assert self.record.truth.covariance is not None
+        return np.asarray(self.record.truth.covariance, float)
 
     @cached_property
     def both(self) -> Record:
         """The record with the covariances of estimate and truth together."""
-        return replace(self.record, covariance=self.P + self.P_t, truth_covariance=None)
+        errors = replace(self.record.errors, covariance=self.P + self.P_t)
+        return replace(self.record, errors=errors, truth=replace(self.record.truth, covariance=None))
 
     @cached_property
     def evidence(self) -> Record:
         """The record of which questions are asked."""
         if not self.contrasted:
             return self.both
-        assert self.record.error is not None
+        assert self.record.errors.error is not None
         counted: Array = self.total.counted
-        error, P = contrasts(np.where(counted[..., None], self.record.error, np.nan), self.P)
-        return replace(self.both, error=error, covariance=P, nees=None)
+        error, P = contrasts(np.where(counted[..., None], self.record.errors.error, np.nan), self.P)
+        return self.both.with_errors(error, P)
 
     @cached_property
     def total(self) -> Sample:
@@ -198,7 +199,7 @@ class UncertainTruth:
 
     def below(self, group: str = MAIN, ratio: float = 1.0) -> float:
         """p value of the covariance of e being at least ``ratio`` P, likewise."""
-        if self.record.truth_shared:
+        if self.record.truth.shared:
             return 1.0
         index = self.groups[group]
         return scale_test(self._alone.group_means(index) / ratio, len(index), self.total.longest).below
@@ -206,7 +207,7 @@ class UncertainTruth:
     @cached_property
     def _alone(self) -> Sample:
         """Of d and P."""
-        sample = sample_of(replace(self.record, nees=self.total.nees), Settings())
+        sample = sample_of(self.record.with_nees(self.total.nees), Settings())
         assert sample is not None
         return sample
 
@@ -267,7 +268,7 @@ class UncertainTruth:
     def truth_share(self) -> TruthShare:
         """Share of the truth's own covariance in that of the errors."""
         axes = {key: self.share(key) for key in self.groups if key != MAIN}
-        return TruthShare(self.share(), axes, self.record.truth_errors, self.record.truth_shared)
+        return TruthShare(self.share(), axes, self.record.truth.errors, self.record.truth.shared)
 
     def of_estimate(self, parts: ErrorParts, answers: Sequence[Answer], settings: Settings) -> ErrorParts:
         """The parts with every ratio that of P."""
@@ -340,7 +341,7 @@ class UncertainTruth:
             most = share * float(distributions.chi2.ppf(0.5 * (1.0 + CONFIDENCE), k)) / k
             low = of_both.low - most
             high = of_both.high
-            if self.record.truth_shared:
+            if self.record.truth.shared:
                 low = max(np.sqrt(of_both.low) - np.sqrt(most), 0.0) ** 2
                 high = (np.sqrt(of_both.high) + np.sqrt(most)) ** 2
         value, low, high = (float(max(end, 0.0) / (1.0 - share)) for end in (of_both.value - share, low, high))
@@ -349,7 +350,7 @@ class UncertainTruth:
 
 def uncertain_truth(record: Record) -> UncertainTruth | None:
     """The truth of a record, where it has a covariance of its own and errors are judged."""
-    if record.truth_covariance is None or record.error is None or record.covariance is None:
+    if record.truth.covariance is None or record.errors.error is None or record.errors.covariance is None:
         return None
     return UncertainTruth(record)
 
@@ -359,7 +360,7 @@ def of_both(record: Record) -> Record:
     truth = uncertain_truth(record)
     if truth is None:
         return record
-    return replace(truth.both, nees=truth.total.nees)
+    return truth.both.with_nees(truth.total.nees)
 
 
 def upper_weights(eigenvalues: Array, ratio: float = 1.0) -> Array:

@@ -50,10 +50,10 @@ def nis_of(innovations: Array, covariances: Array) -> tuple[Array, Array]:
 
 def nis_and_dof(record: Record) -> tuple[Array, Array] | None:
     """NIS of a record and its degrees of freedom, (runs, steps) each; None without any."""
-    if record.nis is not None and record.nis_dof is not None:
-        return record.nis, record.nis_dof
-    if record.innovations is not None and record.innovation_covariances is not None:
-        return nis_of(record.innovations, record.innovation_covariances)
+    if record.innovations.nis is not None and record.innovations.nis_dof is not None:
+        return record.innovations.nis, record.innovations.nis_dof
+    if record.innovations.values is not None and record.innovations.covariances is not None:
+        return nis_of(record.innovations.values, record.innovations.covariances)
     return None
 
 

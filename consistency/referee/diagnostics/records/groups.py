@@ -61,10 +61,6 @@ class Groups:
     def __getitem__(self, rows: Any) -> Groups:
         return replace(self, index=self.index[rows])
 
-    def in_pieces(self, steps: slice, pieces: int) -> Groups:
-        """Some steps of one run, (1, steps), as runs of equal length, (pieces, length)."""
-        return replace(self, index=self.index[0, steps].reshape(pieces, -1))
-
 
 def column_of(name: str, values: ArrayLike) -> Column:
     """Numbers as they are, NaN and infinity left out; anything else, truth values included, as words.

@@ -7,11 +7,11 @@ number. Alignment and time offsets use them before.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -70,70 +70,134 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
-@dataclass(frozen=True, repr=False)
-class Record:
-    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the estimates and the covariances stated for them, or their NEES alone.
 
-    Every source of data gives records, and everything that judges, compares, draws or describes an estimator takes
-    them: arrays of a gate, files of another estimator, and results of the bench take the same way. From the step of a
-    failure on all values are NaN. If the start is known exactly, its covariance is singular: in those steps the NEES
-    and, for files, the covariance are NaN, and the error is not.
-
-    What is large and not always needed, as a map, is a function that reads it when it is called.
+    From the step of a failure on all values are NaN. If the start is known exactly, its covariance is singular: in
+    those steps the NEES and, for files, the covariance are NaN, and the error is not.
     """
 
-    name: str
     error: Array | None = None  # (runs, steps, n), truth minus estimate; NaN where a run has no estimate
     covariance: Array | None = None  # (runs, steps, n, n)
     nees: Array | None = None  # (runs, steps), NaN where it does not count; worked out from the errors if not given
     dof: int = 0  # dimension of the error, where NEES stands alone; 0 where there is none
-    nis: Array | None = None  # (runs, steps), NaN where there was no innovation
-    nis_dof: Array | None = None  # (runs, steps)
-    innovations: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
-    innovation_covariances: Array | None = None  # (runs, steps, m, m)
-    optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
-    failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
     axes: Sequence[str] = ()  # names of the n components, if they have any
     own_names: Mapping[str, str] = field(default_factory=dict)  # of axes, what the user calls them, as a verdict does
     # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
     # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
     parts: tuple[tuple[int, ...], ...] = ()
-    runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
-    landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
-    joint: JointNees | None = None  # of a map
-    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
-    by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
-    groups: Groups | None = None  # (runs, steps), of that column, in which the size of the errors is asked, too
-    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
+    convention: str = ""  # of the error
 
-    # what a fit to the truth leaves of the errors
+    OF_RUNS: ClassVar = ("error", "covariance", "nees")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What a verdict calls the axes: the user's own names where he has some."""
+        return tuple(self.own_names.get(axis, axis) for axis in self.axes)
+
+
+@dataclass(frozen=True)
+class InnovationRecord:
+    """Innovations with their covariances, or their NIS alone."""
+
+    nis: Array | None = None  # (runs, steps), NaN where there was no innovation
+    nis_dof: Array | None = None  # (runs, steps)
+    values: Array | None = None  # (runs, steps, m), for their whiteness; without them the NIS has to do
+    covariances: Array | None = None  # (runs, steps, m, m)
+    optimal_gain: bool = False  # declared: innovations are white if the filter is right, and none was gated away
+
+    OF_RUNS: ClassVar = ("nis", "nis_dof", "values", "covariances")
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What the rows and columns of the arrays are: runs and their steps."""
+
+    numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
+    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
+    times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
+    by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
+    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
+    skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
+    trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
+
+    OF_RUNS: ClassVar = ("numbers", "times", "by")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is stated of the truth itself."""
+
+    covariance: Array | None = None  # (runs, steps, n, n), NaN where it has none
+    errors: str | None = None  # declared: they are "independent", "per-run" or "common" to all runs
+    shared: bool = False  # declared: the estimator has fused the truth
+
+    OF_RUNS: ClassVar = ("covariance",)
+
+
+@dataclass(frozen=True)
+class TruthFit:
+    """What a fit to the truth leaves of the errors."""
+
     align: str = "none"  # how the estimates were moved into the world of the truth; "" if they are known to be in it
     caption: str = ""  # note of the verdict on that
     reduced: bool = False  # the errors may be smaller than the covariance says without a fault
     unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
     unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
 
-    # origin
-    t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
-    times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
+
+@dataclass(frozen=True)
+class Map:
+    """Landmarks, and what a guard of the filter did to observations of them."""
+
+    read: Callable[[], MapRecord | None] | None = None  # reads the maps; None where there are none
+    rejections: Rejections | None = None  # of a filter with a guard
+    landmarks: Indices | None = None  # (steps,), where the record is that of a map: they stand in the place of steps
+    joint: JointNees | None = None  # where the record is that of a map
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a record is from, and what its reader has to say."""
+
     files: Mapping[int, str] = field(default_factory=dict)  # of each run by its number, where files hold them
-    convention: str = ""  # of the error
     notes: tuple[str, ...] = ()  # notes for the reader: the convention, left-out steps
     causes: tuple[str, ...] = ()  # probable mix-ups, which the verdict names; they stand in the notes, too
     window: str | None = None  # "10 s": steps are windows of a log, and errors are those of motions over them
-    independent: bool = False  # errors of different steps are independent, so that each is a run to the referee
     unshown: str = ""  # why nothing can be shown by these windows, so that no question is asked
     path: Array | None = None  # (runs, steps, 2, 2 or 3), m, true and estimated positions, to be drawn
-    guesses: Mapping[str, Record] = field(default_factory=dict)  # by convention, where none is declared
-    truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
-    truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
-    truth_shared: bool = False  # declared: the estimator has fused the truth
-    trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
-    # beside the errors
-    world: Record | None = None  # errors of the same runs as differences in the world, where ``error`` is another
-    map: Callable[[], MapRecord | None] | None = None  # reads the maps; None where there are none
-    rejections: Rejections | None = None  # of a filter with a guard
+    OF_RUNS: ClassVar = ("path",)
+
+
+OfRuns = TypeVar("OfRuns", Errors, InnovationRecord, Runs, Truth, Origin)
+
+
+@dataclass(frozen=True, repr=False)
+class Record:
+    """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
+
+    Every source of data gives records, and everything that judges, compares, draws or describes an estimator takes
+    them: arrays of a gate, files of another estimator, and results of the bench take the same way.
+    :func:`make_record` makes one of arrays.
+
+    What is large and not always needed, as a map, is a function that reads it when it is called.
+    """
+
+    name: str
+    errors: Errors = Errors()
+    innovations: InnovationRecord = InnovationRecord()
+    runs: Runs = field(default_factory=Runs)
+    failures: tuple[Failure, ...] = ()  # Failure.step counts the columns from 1, as the verdict does
+    truth: Truth = Truth()
+    fit: TruthFit = TruthFit()
+    groups: Groups | None = None  # (runs, steps), in which the size of the errors is asked, too
+    map: Map = Map()
+    origin: Origin = Origin()
+    world: Errors | None = None  # of the same runs as differences in the world, where ``errors`` are others
+    guesses: Mapping[str, Record] = field(default_factory=dict)  # by convention, where none is declared
 
     def __post_init__(self) -> None:
         for key, array in arrays_of(self).items():
@@ -146,38 +210,60 @@ class Record:
     @property
     def run_numbers(self) -> Indices:
         """Labels of the runs, (runs,)."""
-        if self.runs is not None:
-            return self.runs
-        there = (self.error, self.nees, self.nis, self.innovations)
+        if self.runs.numbers is not None:
+            return self.runs.numbers
+        there = (self.errors.error, self.errors.nees, self.innovations.nis, self.innovations.values)
         return np.arange(next((len(array) for array in there if array is not None), 0))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What a verdict calls the axes: the user's own names where he has some."""
-        return tuple(self.own_names.get(axis, axis) for axis in self.axes)
 
     @property
     def in_world(self) -> Record:
         """The same runs with their errors as differences in the world: this record where it has no others."""
         if self.world is None:
             return self
-        w = self.world
-        return replace(self, error=w.error, covariance=w.covariance, nees=w.nees, convention=w.convention, world=None)
+        return replace(self, errors=self.world, world=None)
 
     @property
     def errors_alone(self) -> Record:
         """Without what is judged beside the errors and innovations."""
-        return replace(self, world=None, map=None, rejections=None, convention="")
+        of_map = replace(self.map, read=None, rejections=None)
+        return replace(self, errors=replace(self.errors, convention=""), map=of_map, world=None)
+
+    def with_errors(self, error: Array | None, covariance: Array | None, nees: Array | None = None) -> Record:
+        """The record with other errors, covariances and NEES of the same components."""
+        return replace(self, errors=replace(self.errors, error=error, covariance=covariance, nees=nees))
+
+    def with_nees(self, nees: Array) -> Record:
+        """The record with another NEES, (runs, steps)."""
+        return replace(self, errors=replace(self.errors, nees=nees))
+
+    def with_notes(self, *notes: str) -> Record:
+        """The record with more notes behind its own."""
+        return replace(self, origin=replace(self.origin, notes=(*self.origin.notes, *notes)))
+
+    def with_optimal_gain(self) -> Record:
+        """The record of a filter whose gain is declared optimal."""
+        return replace(self, innovations=replace(self.innovations, optimal_gain=True))
+
+    def changed(self, change: Callable[[Any], Any]) -> Record:
+        """The record with ``change`` applied to each of its arrays over runs, (runs, ...), and to its groups."""
+        return replace(
+            self,
+            errors=_changed(self.errors, change),
+            innovations=_changed(self.innovations, change),
+            runs=_changed(self.runs, change),
+            truth=_changed(self.truth, change),
+            groups=None if self.groups is None else replace(self.groups, index=change(self.groups.index)),
+            origin=_changed(self.origin, change),
+            world=None if self.world is None else _changed(self.world, change),
+        )
 
     def of_runs(self, rows: slice | Indices) -> Record:
         """Some of the runs, by their rows, with maps and rejections of all."""
-        arrays = {name: array[rows] for name, array in arrays_of(self).items()}
-        numbers = self.run_numbers[rows]
-        failures = tuple(failure for failure in self.failures if failure.run in numbers)
-        world = None if self.world is None else self.world.of_runs(rows)
+        numbers = self.run_numbers
+        some = replace(self, runs=replace(self.runs, numbers=numbers)).changed(lambda array: array[rows])
+        failures = tuple(failure for failure in self.failures if failure.run in numbers[rows])
         guesses = {kind: one.of_runs(rows) for kind, one in self.guesses.items()}
-        groups = None if self.groups is None else self.groups[rows]
-        return replace(self, **arrays, runs=numbers, failures=failures, world=world, guesses=guesses, groups=groups)
+        return replace(some, failures=failures, guesses=guesses)
 
     def first_runs(self, runs: int) -> Record:
         """Runs 0 to ``runs`` - 1."""
@@ -194,52 +280,65 @@ class Record:
         if skip is None:
             return self
 
-        arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
-        world = self.world
-        t = self.times
-        if world is not None:
-            arrays |= {"world covariance": world.covariance, "world nees": world.nees}
-        if t is None and len(self.t):
-            t = self.t
+        arrays = {
+            "covariance": self.errors.covariance,
+            "nees": self.errors.nees,
+            "nis": self.innovations.nis,
+            "nis_dof": self.innovations.nis_dof,
+            "values": self.innovations.values,
+        }
+        if self.world is not None:
+            arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
+        t = self.runs.times
+        if t is None and len(self.runs.t):
+            t = self.runs.t
         try:
             rest, skipped = without_first(skip, arrays, self.name, t)
         except ValueError as error:
             raise InputError(f"--{error}") from None
+        world = self.world
         if world is not None:
-            world = replace(world, covariance=rest.pop("world covariance"), nees=rest.pop("world nees"))
-        guesses = {kind: one.without_first(skip) for kind, one in self.guesses.items()}
-        return replace(self, **rest, world=world, skipped=skipped, guesses=guesses)
+            world = replace(world, covariance=rest["world covariance"], nees=rest["world nees"])
+        return replace(
+            self,
+            errors=replace(self.errors, covariance=rest["covariance"], nees=rest["nees"]),
+            innovations=replace(self.innovations, nis=rest["nis"], nis_dof=rest["nis_dof"], values=rest["values"]),
+            runs=replace(self.runs, skipped=skipped),
+            world=world,
+            guesses={kind: one.without_first(skip) for kind, one in self.guesses.items()},
+        )
 
     @property
     def as_runs(self) -> Record:
         """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
-        if not self.independent:
+        if not self.runs.independent:
             return self
-        assert self.error is not None
-        assert self.covariance is not None
-        assert self.nees is not None
-        runs, steps = self.error.shape[:2]
-        there = np.isfinite(self.nees)
+        errors = self.errors
+        assert errors.error is not None
+        assert errors.covariance is not None
+        assert errors.nees is not None
+        runs, steps = errors.error.shape[:2]
+        there = np.isfinite(errors.nees)
         number = np.arange(1, runs * steps + 1).reshape(runs, steps)
         failures = [(int(np.flatnonzero(self.run_numbers == f.run)[0]), f) for f in self.failures]
         for row, f in failures:
             there[row, f.step - 1] = True
         return Record(
-            self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
-            self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            axes=self.axes, own_names=self.own_names, parts=self.parts, runs=number[there], unit="window",
-            skipped=self.skipped,
+            self.name,
+            replace(_changed(errors, lambda array: array[there][:, None]), convention=""),
+            runs=Runs(number[there], "window", skipped=self.runs.skipped),
+            failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
             groups=None if self.groups is None else self.groups[there, None],
-        )  # fmt: skip
+        )
 
     @property
     def left_out_steps(self) -> list[int]:
         """Steps, counted from 1, in which the covariance of some run is not of full rank yet."""
-        if self.error is None or self.nees is None:
+        if self.errors.error is None or self.errors.nees is None:
             return []
-        deficient = np.isfinite(self.error).all(axis=-1) & np.isnan(self.nees)
-        if self.skipped is not None:
-            deficient[:, : self.skipped.steps] = False
+        deficient = np.isfinite(self.errors.error).all(axis=-1) & np.isnan(self.errors.nees)
+        if self.runs.skipped is not None:
+            deficient[:, : self.runs.skipped.steps] = False
         return [int(k) + 1 for k in np.flatnonzero(deficient.any(axis=0))]
 
     def plot(self, path: str | Path | None = None) -> Any:
@@ -267,7 +366,64 @@ class Record:
         return str(shown_by("record_html", self))
 
 
-Evidence = Record  # name of the record in scripts of before
+def make_record(
+    name: str,
+    error: Array | None = None,
+    covariance: Array | None = None,
+    nees: Array | None = None,
+    dof: int = 0,
+    *,
+    axes: Sequence[str] = (),
+    parts: tuple[tuple[int, ...], ...] = (),
+    convention: str = "",
+    nis: Array | None = None,
+    nis_dof: Array | None = None,
+    innovations: Array | None = None,
+    innovation_covariances: Array | None = None,
+    optimal_gain: bool = False,
+    failures: Iterable[Failure] = (),
+    runs: Indices | None = None,
+    unit: str = "run",
+    t: Array | None = None,
+    files: Mapping[int, str] | None = None,
+    truth_covariance: Array | None = None,
+    truth_errors: str | None = None,
+    truth_shared: bool = False,
+    groups: Groups | None = None,
+) -> Record:
+    """A record of arrays: errors with covariances, or NEES with its degrees of freedom, or innovations.
+
+    Parameters
+    ----------
+    error : (runs, steps, n), truth minus estimate
+    covariance : (runs, steps, n, n)
+    nees : (runs, steps)
+    dof : dimension of the error
+    axes, parts, convention : as in :class:`Errors`
+    nis, nis_dof : (runs, steps)
+    innovations : (runs, steps, m)
+    innovation_covariances : (runs, steps, m, m)
+    optimal_gain : as in :class:`InnovationRecord`
+    runs : (runs,), numbers of the runs
+    unit : what a run is called
+    t : (steps,), s
+    files : of each run by its number
+    truth_covariance : (runs, steps, n, n), with what is declared of it, as in :class:`Truth`
+    groups : (runs, steps), in which the size of the errors is asked, too
+    """
+    return Record(
+        name,
+        Errors(error, covariance, nees, dof, axes, parts=parts, convention=convention),
+        InnovationRecord(nis, nis_dof, innovations, innovation_covariances, optimal_gain),
+        Runs(runs, unit, np.empty(0) if t is None else t),
+        failures=tuple(failures),
+        truth=Truth(truth_covariance, truth_errors, truth_shared),
+        groups=groups,
+        origin=Origin(files or {}),
+    )
+
+
+Evidence = make_record  # its name in scripts of before
 
 
 def numbered_axes(n: int) -> tuple[str, ...]:
@@ -281,10 +437,23 @@ def shown_by(function: str, *arguments: Any) -> Any:
 
 
 def arrays_of(record: Record) -> dict[str, Any]:
-    """Arrays over runs and steps that a record has, by name."""
-    names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-             "truth_covariance", "path", "by")  # fmt: skip
-    return {name: array for name in names if (array := getattr(record, name)) is not None}
+    """Arrays over runs that a record has, by the name of their value and their own: "errors.nees"."""
+    arrays = {}
+    for part in ("errors", "innovations", "runs", "truth", "origin"):
+        value = getattr(record, part)
+        for name in value.OF_RUNS:
+            if (array := getattr(value, name)) is not None:
+                arrays[f"{part}.{name}"] = array
+    return arrays
+
+
+def _changed(value: OfRuns, change: Callable[[Any], Any]) -> OfRuns:
+    """A value with ``change`` applied to each of its arrays over runs."""
+    arrays: dict[str, Any] = {}
+    for name in value.OF_RUNS:
+        if (array := getattr(value, name)) is not None:
+            arrays[name] = change(array)
+    return replace(value, **arrays)
 
 
 def each_alone(record: Record) -> Record:
@@ -295,12 +464,13 @@ def each_alone(record: Record) -> Record:
     ValueError
         The record has no errors.
     """
-    if record.error is None:
+    if record.errors.error is None:
         raise ValueError(f"{record.name}: has no errors")
-    n = record.error.shape[-1]
+    n = record.errors.error.shape[-1]
     reasons = [f.reason.replace(INDEFINITE, "a standard deviation is not above 0") for f in record.failures]
     failures = tuple(replace(f, reason=reason) for f, reason in zip(record.failures, reasons, strict=True))
-    return replace(record, failures=failures, parts=tuple((i,) for i in range(n)) if n > 1 else ())
+    errors = replace(record.errors, parts=tuple((i,) for i in range(n)) if n > 1 else ())
+    return replace(record, errors=errors, failures=failures)
 
 
 @dataclass(frozen=True)

@@ -517,8 +517,10 @@ def _unshown_sentence(v: Findings) -> str:
 
 def other_ways(status: str, record: Record) -> list[str]:
     """What else would decide on a single log of poses."""
-    is_log = len(record.run_numbers) == 1 and record.window is None and record.align and record.convention
-    if status != "undecided" or not is_log or not ATTITUDE & set(record.axes):
+    is_log = (
+        len(record.run_numbers) == 1 and record.origin.window is None and record.fit.align and record.errors.convention
+    )
+    if status != "undecided" or not is_log or not ATTITUDE & set(record.errors.axes):
         return []
     return [
         "--relative 10s (or steps, or metres) makes many windows of one log, if the file has motions with covariances, "
@@ -557,25 +559,25 @@ def same_truth(record: Record, found: Findings) -> list[str]:
     There it has to be worse than in most: a covariance that is too large throughout is so for another reason.
     """
     where = found.location
-    if record.path is None or where is None or where.first_outside is None or len(record.path) < FEWEST:
+    if record.origin.path is None or where is None or where.first_outside is None or len(record.origin.path) < FEWEST:
         return []
-    assert record.nees is not None
+    assert record.errors.nees is not None
     assert found.scale is not None
     step = int(np.argmax(found.scale.alive > 0))
     anees = found.scale.anees
     is_below = bool(anees[step] < min(where.simultaneous[step, 0], LESS * float(np.nanmedian(anees))))
     if not is_below or not set(found.faults) & set(SCALE):
         return []
-    true = record.path[:, :, 0]
+    true = record.origin.path[:, :, 0]
     apart = np.abs(true - true[:1])
     if np.nanmax(apart) <= ROUNDING * max(float(np.nanmax(np.abs(true))), 1.0):
         return [
             "all runs have the same true path: draw its start from the first covariance, which allows for others, and "
             "the rest from the filter's model"
         ]
-    counted = np.isfinite(record.nees[:, step])
-    index = [i for i, axis in enumerate(record.axes) if axis in POSITION]
-    stated = np.asarray(record.covariance)[counted, step][:, index, index].mean(axis=0).sum()
+    counted = np.isfinite(record.errors.nees[:, step])
+    index = [i for i, axis in enumerate(record.errors.axes) if axis in POSITION]
+    stated = np.asarray(record.errors.covariance)[counted, step][:, index, index].mean(axis=0).sum()
     if np.nanvar(true[counted, step], axis=0).sum() < SAME * stated:
         return [
             "all runs have the same true start, which the covariance does not know: draw it from the first covariance"

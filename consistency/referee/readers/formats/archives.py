@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.records.groups import on_steps
-from consistency.referee.diagnostics.records.record import Record, numbered_axes
+from consistency.referee.diagnostics.records.record import (
+    Errors,
+    InnovationRecord,
+    Record,
+    Runs,
+    TruthFit,
+    numbered_axes,
+)
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import INERTIAL, PLANAR, state_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
@@ -30,10 +37,10 @@ from consistency.referee.types import Array, Failure, Indices
 OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
 PLANAR_POSE = ("x", "y", "heading")
 OF_STATES = {"R", "p", "v"}  # of an inertial filter
-BY_STEP: dict[str, Any] = {  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
-    "unavailable": ("distribution",),
-    "caption": "the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
-}
+BY_STEP = TruthFit(  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
+    unavailable=("distribution",),
+    caption="the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
+)
 OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
 FEWEST = 10  # runs and steps from which on swapped arrays are looked for
 ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
@@ -95,8 +102,8 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     kind = _kind(archive, r)
     if kind == OF_NEES:
         found = _of_nees(archive)
-        assert found.nees is not None
-        return replace(found, by=archive.groups(r, found.nees.shape))
+        assert found.errors.nees is not None
+        return replace(found, runs=replace(found.runs, by=archive.groups(r, found.errors.nees.shape)))
     declared = ""
     if kind != OF_NEES:
         require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
@@ -256,7 +263,7 @@ def _of_nees(archive: Archive) -> Record:
         raise InputError(f"{path}: key 'nees', run {run}, step {step + 1}: {nees[run, step]:g} is negative")
     runs, steps = nees.shape
     n = int(dof.min())
-    by_step = BY_STEP if (dof != dof[0, 0]).any() else {}
+    fit = BY_STEP if (dof != dof[0, 0]).any() else TruthFit()
     nees *= n / dof
     nis, nis_dof = archive.nis((runs, steps))
     known = archive.known(runs, steps)
@@ -272,15 +279,11 @@ def _of_nees(archive: Archive) -> Record:
             failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
     return Record(
         path.stem,
-        nees=nees,
-        dof=n,
-        nis=nis,
-        nis_dof=nis_dof,
-        failures=tuple(failures),
-        axes=archive.axes(n),
-        runs=np.arange(runs),
-        t=archive.times(steps),
-        **by_step,
+        Errors(nees=nees, dof=n, axes=archive.axes(n)),
+        InnovationRecord(nis, nis_dof),
+        Runs(np.arange(runs), t=archive.times(steps)),
+        tuple(failures),
+        fit=fit,
     )
 
 

@@ -176,13 +176,13 @@ def _either(texts: Sequence[str]) -> str:
 def _status(fit: ReadingFit) -> int:
     """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
     from consistency.referee.diagnostics.judge_record import judge
-    from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.records.record import make_record
 
     longest = max(map(len, fit.whitened))
     nees = np.full((len(fit.whitened), longest), np.nan)
     for row, w in zip(nees, fit.whitened, strict=True):
         row[: len(w)] = np.square(w).sum(axis=1)
-    verdict = judge(Record("", nees=nees, dof=fit.n))
+    verdict = judge(make_record("", nees=nees, dof=fit.n))
     return {"consistent": 0, "undecided": 1}.get(verdict.status, 2)
 
 

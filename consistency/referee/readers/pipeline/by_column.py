@@ -76,7 +76,7 @@ def in_groups(
         As :func:`grouped`.
     """
     if pairs:
-        axes = itertools.chain.from_iterable(record.axes for record in records)
+        axes = itertools.chain.from_iterable(record.errors.axes for record in records)
         column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
     return [grouped(record, column, r) for record in records]
 
@@ -123,22 +123,22 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     InputError
         The column is made from the errors, or makes no groups.
     """
-    if record.by is None:
+    if record.runs.by is None:
         return record
-    if record.nees is None:
+    if record.errors.nees is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
     if column.words and r.bins is not None:
         flag = option.replace("by", "bins")
         raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
-    counted = np.isfinite(record.nees)
+    counted = np.isfinite(record.errors.nees)
     if not counted.any():
         return record
     some = _some(int(counted.sum()))
     run, step = (places[some] for places in np.nonzero(counted))
     error = None
-    if record.error is not None:
-        error = record.error[run, step]
-    if why := made_from_errors(column.name, record.by[run, step], error, record.nees[run, step]):
+    if record.errors.error is not None:
+        error = record.errors.error[run, step]
+    if why := made_from_errors(column.name, record.runs.by[run, step], error, record.errors.nees[run, step]):
         raise InputError(
             f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
             "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
@@ -146,7 +146,7 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
         )
     try:
         bins = BINS if r.bins is None else r.bins
-        groups = groups_of(replace(column, values=record.by), bins, counted)
+        groups = groups_of(replace(column, values=record.runs.by), bins, counted)
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
@@ -161,10 +161,10 @@ def record_in_groups(record: Record, r: Reading) -> Record:
         The files have no such column, or as :func:`grouped`.
     """
     assert r.by is not None
-    cells = record.by
+    cells = record.runs.by
     if r.by_file is not None:
         sheet = _sheet(r)
-        of_runs = [_looked_up(sheet, r.by, int(run), record.t) for run in record.run_numbers]
+        of_runs = [_looked_up(sheet, r.by, int(run), record.runs.t) for run in record.run_numbers]
         cells = np.stack(of_runs)
     if cells is None:
         raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
@@ -174,8 +174,10 @@ def record_in_groups(record: Record, r: Reading) -> Record:
 def _by_cells(record: Record, name: str, cells: Array, r: Reading, option: str = "--by") -> Record:
     """The record with groups of the cells of a column, (runs, steps)."""
     column = column_of(name, cells)
-    column = replace(column, outcome=selects_on_outcome(column, record.axes, covariance=record.covariance))
-    return grouped(replace(record, by=column.values), column, r, option)
+    column = replace(
+        column, outcome=selects_on_outcome(column, record.errors.axes, covariance=record.errors.covariance)
+    )
+    return grouped(replace(record, runs=replace(record.runs, by=column.values)), column, r, option)
 
 
 def with_groups(
@@ -194,11 +196,11 @@ def with_groups(
         by = {"array": by}
     if len(by) != 1:
         raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
-    if record.nees is None:
+    if record.errors.nees is None:
         raise InputError(f"by: {record.name} {NO_TRUTH}")
     ((name, values),) = by.items()
     try:
-        cells = on_steps(values, record.nees.shape)
+        cells = on_steps(values, record.errors.nees.shape)
     except ValueError as wrong:
         raise InputError(f"by: {wrong}") from None
     return _by_cells(record, name, cells, Reading(bins=bins), "by")

@@ -214,7 +214,7 @@ def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estima
         No run can be judged.
     """
     study = study_in(folder)
-    runs = Runs(study, r, found_in)
+    runs = ProgramRuns(study, r, found_in)
     for run in runs_in(folder).values():
         runs.take(run)
     if not runs.found:
@@ -223,7 +223,7 @@ def read_program_runs(folder: Path, r: Reading, found_in: Reader) -> list[Estima
     return runs.estimators(runs.first if study.design else None)
 
 
-class Runs:
+class ProgramRuns:
     """Runs of a program as they come, each read once.
 
     Parameters
@@ -400,7 +400,7 @@ def _without_folder(one: Estimator, folder: Path) -> Estimator:
 def _require_whole(records: Sequence[Record]) -> None:
     """Refuse a file whose last line is cut short: the program has ended."""
     for record in records:
-        for note in record.notes:
+        for note in record.origin.notes:
             if isinstance(note, CutNote):
                 raise InputError(f"{note.rpartition(': ')[0]}: its last line is cut short")
 

@@ -266,7 +266,7 @@ def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) 
     """
     r.refuse(f"--error {GUESS}", NO_GUESS)
     first = read(None)
-    default = first[0].convention
+    default = first[0].errors.convention
     if default not in (*PLANAR, *SPATIAL) or default == "vector":
         raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
     guesses = {one.name: {default: one} for one in first}
@@ -279,7 +279,7 @@ def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) 
 
 def _declared(records: list[Record], r: Reading) -> list[Record]:
     """Records with what is declared of their truth, in pieces where that is asked."""
-    if r.given(OF_TRUTH) or any(record.truth_covariance is not None for record in records):
+    if r.given(OF_TRUTH) or any(record.truth.covariance is not None for record in records):
         from consistency.referee.readers.truth_covariance import declared
 
         records = declared(records, r)
@@ -320,15 +320,17 @@ def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
     records = []
     for record in records_of(e, r):
         own = own_names(record, r)
-        records.append(replace(with_failed_runs(record, e.failed), trials=e.trials, own_names=own))
+        record = with_failed_runs(record, e.failed)
+        errors = replace(record.errors, own_names=own)
+        records.append(replace(record, errors=errors, runs=replace(record.runs, trials=e.trials)))
     return records
 
 
 def own_names(record: Record, r: Reading) -> dict[str, str]:
     """What ``--columns`` calls components whose errors are differences of columns; none of others, as in the body."""
-    if record.convention not in IN_COLUMNS or record.window is not None or r.align is not None:
+    if record.errors.convention not in IN_COLUMNS or record.origin.window is not None or r.align is not None:
         return {}
-    return columns_of_axes(record.axes, r.columns)
+    return columns_of_axes(record.errors.axes, r.columns)
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
@@ -338,7 +340,8 @@ def _by_kind(estimates: Path, r: Reading) -> list[Record]:
         of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
         notes.insert(0, f"{r.truth}: {of}")
     if any(notes):
-        records[0] = replace(records[0], notes=(*filter(None, notes), *records[0].notes))
+        origin = records[0].origin
+        records[0] = replace(records[0], origin=replace(origin, notes=(*filter(None, notes), *origin.notes)))
     return records
 
 

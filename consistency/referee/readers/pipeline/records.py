@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record, each_alone
+from consistency.referee.diagnostics.records.record import Record, TruthFit, each_alone
 from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.axes_and_units import require_radians
@@ -112,13 +112,13 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     if e.in_space and r.axes is None:
         judged, level = level_components(e, judged)
     of_clocks: list[str] = []
-    of_alignment: dict[str, Any] = {}
+    fit = TruthFit()
     if r.align is not None:
         from consistency.referee.readers.alignment import clocks_and_frames
 
         shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
         runs = moved.runs
-        of_alignment = moved.of_record
+        fit = moved.fit
         of_clocks += moved.notes
     elif not runs[0].numbered:
         from consistency.referee.readers.clocks import clock_shift
@@ -145,7 +145,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     tracks = [_track(e, p, error) for p, error in zip(pairs, errors, strict=True)]
     tracks, t, numbering = _in_columns(e, pairs, tracks)
     notes += numbering
-    of_alignment |= {"files": {p.run: str(p.files[0]) for p in runs}}
+    files = {p.run: str(p.files[0]) for p in runs}
     records = []
     for ending, group in e.stated.groups.items():
         part = [i for i in range(len(e.axes))[group] if i in judged]
@@ -154,7 +154,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         some = [track.part(part) for track in tracks]
         axes = tuple(e.axes[i] for i in part)
         record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
-        record = replace(record, causes=tuple(causes), **of_alignment)
+        record = replace(record, fit=fit, origin=replace(record.origin, files=files, causes=tuple(causes)))
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
@@ -375,7 +375,7 @@ def _innovations(e: Estimator) -> Record:
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
     record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
-    return replace(record, error=None, dof=0)
+    return replace(record, errors=replace(record.errors, error=None, dof=0))
 
 
 def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:
@@ -401,5 +401,5 @@ def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative
     record = relative_recording(e.name, str(e.covariances or e.path), runs, axes, judged, relative)
     causes = causes_of_motions(e.said, runs, axes, judged, relative)
     left_out = _left_out(e, runs, [p.matched() for p in runs])
-    notes = (*e.notes, *left_out, *record.notes, *causes)
-    return replace(record, notes=notes, causes=tuple(causes))
+    notes = (*e.notes, *left_out, *record.origin.notes, *causes)
+    return replace(record, origin=replace(record.origin, notes=notes, causes=tuple(causes)))

@@ -175,13 +175,21 @@ def relative_recording(
         notes.append(_doubt(name, of, relative))
     names = tuple(axes[i] for i in judged)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
-    record = replace(record, window=relative.text, independent=relative.independent)
+    record = replace(
+        record,
+        runs=replace(record.runs, independent=relative.independent),
+        origin=replace(record.origin, window=relative.text),
+    )
     if not relative.independent:
         return record
     caption = ""
     if of.doubtful:
         caption = f"the {_whose(relative)} do not seem to be independent, on which this rests"
-    return replace(record, caption=caption, unshown=_too_few(of, relative))
+    return replace(
+        record,
+        fit=replace(record.fit, caption=caption),
+        origin=replace(record.origin, unshown=_too_few(of, relative)),
+    )
 
 
 def _notes(name: str, found: Sequence[Windows], n: int, convention: str, relative: Relative) -> list[str]:

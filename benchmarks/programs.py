@@ -93,8 +93,8 @@ def time_for_a_run(runs: int) -> None:
 
         return inner
 
-    ProgramRuns.take = timed(Runs.take, "reading")  # type: ignore[method-assign]
-    ProgramRuns.estimators = timed(Runs.estimators, "merging")  # type: ignore[method-assign]
+    ProgramRuns.take = timed(ProgramRuns.take, "reading")  # type: ignore[method-assign]
+    ProgramRuns.estimators = timed(ProgramRuns.estimators, "merging")  # type: ignore[method-assign]
     before = resource.getrusage(resource.RUSAGE_SELF)
     with tempfile.TemporaryDirectory() as place:
         plan = Plan(runs, jobs=1)

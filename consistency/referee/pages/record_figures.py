@@ -147,7 +147,7 @@ def has_one_step(record: Record) -> bool:
 
 def _span_runs(axes: Axes, record: Record) -> None:
     """Draw the axis from the first run to the last."""
-    axes.set(xlabel="run", xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
+    axes.set(xlabel=record.unit, xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
 # --- errors -----------------------------------------------------------------------------------------
@@ -380,7 +380,7 @@ def _single_nees(record: Record) -> Picture | None:
     nees = record.nees
     if nees is None or not np.isfinite(nees).any():
         return None
-    what, each, note = "each run", "one run", ""
+    what, each, note = f"each {record.unit}", f"one {record.unit}", ""
     if record.independent:
         note = time_axis_of(record.t).note
         what, each = f"the motion over each window of {record.window or 'a step'}", "one window"
@@ -404,7 +404,7 @@ def _single_nees(record: Record) -> Picture | None:
         if wide([nees]):
             log_axis(axes, "y")
 
-    plural_of = "windows" if record.independent else "runs"
+    plural_of = "windows" if record.independent else f"{record.unit}s"
     caption = (
         f"NEES of {what}; {record.dof} is expected in the mean (line). Above is overconfident, below conservative. "
         f"Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"

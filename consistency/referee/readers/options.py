@@ -100,6 +100,9 @@ class Reading:
         "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
     )
     windows: str | None = _option("'independent': treat each window as an independent run.")
+    independent: bool | None = _option(
+        "Treat each row, or window, as an independent run: a calibration, an image, a detection.", flag="--independent/"
+    )
     align: str | None = _option(
         "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
         "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",

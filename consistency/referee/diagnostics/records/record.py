@@ -101,7 +101,7 @@ class Record:
     runs: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
     landmarks: Indices | None = None  # (steps,), of a map: the landmarks that stand in the place of steps
     joint: JointNees | None = None  # of a map
-    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    unit: str = "run"  # what a run is called: a "row" or "window" where those are independent, a "piece" of a log
     by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
     groups: Groups | None = None  # (runs, steps), of that column, in which the size of the errors is asked, too
     skipped: Skipped | None = None  # first steps that are left out, and are NaN in every array but the error
@@ -212,25 +212,34 @@ class Record:
 
     @property
     def as_runs(self) -> Record:
-        """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
+        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none.
+
+        Runs of one step keep their numbers.
+        """
         if not self.independent:
             return self
-        assert self.error is not None
-        assert self.covariance is not None
-        assert self.nees is not None
-        runs, steps = self.error.shape[:2]
-        there = np.isfinite(self.nees)
-        number = np.arange(1, runs * steps + 1).reshape(runs, steps)
-        failures = [(int(np.flatnonzero(self.run_numbers == f.run)[0]), f) for f in self.failures]
-        for row, f in failures:
-            there[row, f.step - 1] = True
-        return Record(
-            self.name, self.error[there][:, None], self.covariance[there][:, None], self.nees[there][:, None],
-            self.dof, failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            axes=self.axes, own_names=self.own_names, parts=self.parts, runs=number[there], unit="window",
-            skipped=self.skipped,
+        judged = [values for values in (self.nees, self.nis) if values is not None]
+        there = np.any([np.isfinite(values) for values in judged], axis=0)
+        number = np.arange(1, there.size + 1).reshape(there.shape)
+        if there.shape[1] == 1 and self.window is None:
+            number = self.run_numbers[:, None]
+        rows = [int(np.flatnonzero(self.run_numbers == f.run)[0]) for f in self.failures]
+        at = [(row, f.step - 1) for row, f in zip(rows, self.failures, strict=True)]
+        for place in at:
+            there[place] = True
+        failed = (replace(f, run=int(number[place]), step=1) for place, f in zip(at, self.failures, strict=True))
+        return replace(
+            self,
+            **{name: array[there][:, None] for name, array in arrays_of(self).items()},
+            failures=tuple(failed),
+            runs=number[there],
+            unit="row" if self.window is None else "window",
+            independent=False,
             groups=None if self.groups is None else self.groups[there, None],
-        )  # fmt: skip
+            t=np.full(1, np.nan),
+            files={},
+            trials={},
+        )
 
     @property
     def left_out_steps(self) -> list[int]:

@@ -314,7 +314,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
     if not v.faults:
-        lines += _two_intervals(s)
+        lines += _two_intervals(s, v.unit)
     worst = clear(v.worst_axis)
     of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
@@ -343,7 +343,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     return lines
 
 
-def _two_intervals(s: Scale) -> list[str]:
+def _two_intervals(s: Scale, unit: str) -> list[str]:
     """That the interval of the tests is not that of the ratio, where it is the wider one at the lower level."""
     tests = s.equivalence.interval
     if tests is None or s.equivalence.one_sided or not s.inflation.high > 0.0:
@@ -352,8 +352,8 @@ def _two_intervals(s: Scale) -> list[str]:
     if (tests[0] >= low and tests[1] <= high) or is_uncertain(s.inflation):
         return []
     return [
-        f"95 % interval {short(low)} to {short(high)} by the spread between these runs; that of the two tests is wider "
-        "where it also holds if the covariance is right in some runs only"
+        f"95 % interval {short(low)} to {short(high)} by the spread between these {unit}s; that of the two tests is "
+        "wider where it also holds if the covariance is right in some runs only"
     ]
 
 

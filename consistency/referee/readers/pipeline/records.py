@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from consistency.referee.readers.runs_to_record import Relative
 
 OF_WINDOWS = ("relative", "motions", "windows")  # options
+INDEPENDENT = "independent"  # value of the last of them
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 
@@ -57,7 +58,7 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
     if e.innovations_alone and r.by is None:
-        return [_innovations(e)]
+        return [_innovations(e, bool(r.independent))]
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
     if r.by is None:
@@ -84,7 +85,8 @@ def windows_asked(r: Reading) -> Relative | None:
         return None
     from consistency.referee.readers.runs_to_record import relative_of
 
-    return relative_of(r.relative, bool(r.motions), r.windows)
+    windows = INDEPENDENT if r.independent and r.relative is not None else r.windows
+    return relative_of(r.relative, bool(r.motions), windows)
 
 
 def _judged(e: Estimator, r: Reading) -> list[int]:
@@ -153,8 +155,9 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
             continue
         some = [track.part(part) for track in tracks]
         axes = tuple(e.axes[i] for i in part)
-        record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
-        record = replace(record, causes=tuple(causes), **of_alignment)
+        file, rows = str(e.covariances or e.path), bool(r.independent)
+        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
+        record = replace(record, causes=tuple(causes), independent=rows, **of_alignment)
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
@@ -366,7 +369,7 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     return in_columns(some, columns), t, notes
 
 
-def _innovations(e: Estimator) -> Record:
+def _innovations(e: Estimator, independent: bool) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
@@ -374,8 +377,8 @@ def _innovations(e: Estimator) -> Record:
         tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
-    return replace(record, error=None, dof=0)
+    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes, independent=independent)
+    return replace(record, error=None, dof=0, independent=independent)
 
 
 def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:

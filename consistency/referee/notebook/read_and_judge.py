@@ -115,8 +115,9 @@ def read(
     reading = Reading(
         truth=true, covariance=stated, error=error, state=state, covariance_order=covariance_order, max_dt=max_dt,
         time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
-        motions=motions or None, windows=windows, independent=independent or None, align=align, lever_arm=lever_arm, split=split,
-        truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
+        motions=motions or None, windows=windows, independent=independent or None, align=align,
+        lever_arm=lever_arm, split=split, truth_covariance=of_truth, truth_errors=truth_errors,
+        truth_shared=truth_shared or None,
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
         world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,

@@ -139,6 +139,7 @@ class Reading:
     truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
     dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
+    unstated: bool | None = None  # of no command line: the covariance is I where the files state none
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

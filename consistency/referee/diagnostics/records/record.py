@@ -128,6 +128,7 @@ class Record:
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
     truth_shared: bool = False  # declared: the estimator has fused the truth
+    assumed: bool = False  # none is stated: the covariance is I, to be corrected
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
     # beside the errors

@@ -43,6 +43,7 @@ FEWEST = 8  # runs; fewer true starts may be near each other by chance
 SAME = 0.1  # of the stated variance of the position, which that of true starts drawn from it exceeds
 LESS = 0.5  # of the median of all steps, that the NEES of the first one is at most
 ROUNDING = 1e-9  # of the extent of a path
+MEMORYLESS = 1.5  # steps, over which errors decorrelate whose rows may be independent
 
 
 def reasons(v: Findings) -> list[str]:
@@ -417,6 +418,8 @@ def _ratio_within(w: Within, steps: int, undecided: bool) -> str:
     )
     if not undecided or w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
         return text
+    if w.steps <= steps and w.correlation < MEMORYLESS:
+        text += "; if rows do not depend on each other, as images or detections, --independent makes each a run"
     if w.steps <= steps:
         return f"{text}; cut into {w.pieces} runs, this log would then probably decide"
     return f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"

@@ -59,6 +59,8 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     """
     if e.innovations_alone and r.by is None:
         return [_innovations(e, bool(r.independent))]
+    if r.unstated:
+        e = with_unit_covariances(e)
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
     if r.by is None:
@@ -69,6 +71,23 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     e, column = with_values(e, r, judged)
     records, pairs = _records(e, judged, r)
     return in_groups(records, column, e, pairs, r)
+
+
+def with_unit_covariances(e: Estimator) -> Estimator:
+    """The estimator with covariances I, and a note, where none is stated; itself otherwise.
+
+    Zeros state none, and neither does one multiple of I in every row of poses, whose units differ.
+    """
+    first = next((p.covariance[p.stated][0] for p in e.runs if p.stated.any()), np.zeros((1, 1)))
+    placeholder = first[0, 0] * np.eye(len(first)) if e.runs[0].manifold != "vector" else np.zeros((1, 1))
+    if not all((p.covariance[p.stated] == placeholder).all() for p in e.runs):  # NaN is stated, too: a failure
+        return e
+    runs = []
+    for p in e.runs:
+        unit = np.broadcast_to(np.eye(p.covariance.shape[-1]), p.covariance.shape)
+        runs.append(replace(p, covariance=unit, stated=np.ones(len(p.t), bool)))
+    note = f"{e.said}: states no covariance; it is taken as I, which a factor for each component corrects"
+    return replace(e, runs=runs, stated=WHOLE, notes=(*e.notes, note), assumed=True)
 
 
 def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
@@ -157,7 +176,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         axes = tuple(e.axes[i] for i in part)
         file, rows = str(e.covariances or e.path), bool(r.independent)
         record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
-        record = replace(record, causes=tuple(causes), independent=rows, **of_alignment)
+        record = replace(record, causes=tuple(causes), independent=rows, assumed=e.assumed, **of_alignment)
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
@@ -303,7 +322,7 @@ def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[
 
 def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Hints on mix-ups, which are loaded where the errors do not fit."""
-    if is_plausible(runs, shift, judged):
+    if e.assumed or is_plausible(runs, shift, judged):
         return []
     from consistency.referee.readers.mix_ups.hints import hints
 

@@ -86,7 +86,7 @@ def _gate(m: Monitor) -> list[str]:
         return []
     left_out = m.measurements - m.tried
     text = (
-        f"The gate rejected {100 * m.refused / m.tried:.2g} % of {plural(m.tried, 'measurement')} (a right filter: "
+        f"The gate rejected {percent(m.refused / m.tried)} of {plural(m.tried, 'measurement')} (a right filter: "
         f"{percent(1 - m.gate)})"
     )
     if left_out:

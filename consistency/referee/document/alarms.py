@@ -84,21 +84,21 @@ def _gate(m: Monitor) -> list[str]:
     share = m.gate_share
     if share is None or m.gate is None:
         return []
-    left_out = m.measurements - m.tried
-    text = (
-        f"The gate rejected {percent(m.refused / m.tried)} of {plural(m.tried, 'measurement')} (a right filter: "
-        f"{percent(1 - m.gate)})"
-    )
-    if left_out:
-        text += f", {left_out} right after a rejection left out"
+    text = f"The gate rejected {percent(m.rejections / m.measurements)} of {plural(m.measurements, 'measurement')}"
+    if m.tried < m.measurements:
+        text += f", and {percent(m.refused / m.tried)} of the {m.tried} that do not come right after a rejection"
+    text += f" (a right filter: {percent(1 - m.gate)})"
     rate = f"at a false-alarm rate of {percent(FALSE_ALARM)}"
     if share.finding == "too few":
         text += (
-            f": too few (p {p_text(share.few)}, {rate}), so that S is too large, unless the log leaves out what was "
-            "rejected."
+            f": too few (p {p_text(share.few)}, {rate}), so that the stated innovation covariance is too large, unless "
+            "the log leaves out what was rejected."
         )
     elif share.finding:
-        text += f": too many (p {p_text(share.many)}, {rate}): S is too small, or there are outliers."
+        text += (
+            f": too many (p {p_text(share.many)}, {rate}): the stated innovation covariance is too small, or there are "
+            "outliers."
+        )
     elif m.refused == 0:
         text += f", which shows nothing: {share.fewest} without a rejection would show that there are too few."
     else:
@@ -106,7 +106,7 @@ def _gate(m: Monitor) -> list[str]:
     spikes = []
     for dof, (found, right) in list(m.smallest_spikes.items())[:SHOWN]:
         is_off = np.isfinite(m.scale) and not 1.0 / m.tolerance <= m.scale <= m.tolerance
-        of_right = f" ({right:.2g} if S were right)" if is_off else ""
+        of_right = f" ({right:.2g} if its covariance were right)" if is_off else ""
         spikes.append(f"{found if np.isfinite(m.scale) else right:.2g} in {dof}-D{of_right}")
     return [
         text,

@@ -254,9 +254,7 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys):
     assert "rejected" in out
     assert "$odd$" in out
     assert "no alarm" in out
-    assert (
-        "rejected 25 % of 267 measurements (a right filter: 1 %), 133 right after a rejection left out: too many" in out
-    )
+    assert "rejected 50 % of 400 measurements, and 0.5 % of the 201 that do not come right after a rejection (a" in out
     show(*document_of(changed()).opening)
     out = capsys.readouterr().out
     assert "rejected" not in out
@@ -272,7 +270,7 @@ def test_the_terminal_shows_numbers_and_a_sentence(capsys):
     )
     show(*document_of(watch(none, make_monitor("optimal", gate=0.99))).opening)
     out = capsys.readouterr().out
-    assert "rejected 100 % of 1 measurement (a right filter: 1 %), 2 right after" in out  # a step without one is none
+    assert "rejected 33 % of 3 measurements, and 100 % of the 1 that" in out  # a step without one is none
     show(*document_of(changed(1.0)).opening)
     assert "no alarm" in capsys.readouterr().out
 

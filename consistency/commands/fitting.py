@@ -117,7 +117,9 @@ CORRECTABLE = [each.name for each in fields(Reading) if each.name not in NOT_COR
 
 @reads_files(only=CORRECTABLE)
 def correct_command(
-    path: Annotated[Path, typer.Argument(metavar="ESTIMATES", help=f"Estimates with covariances: {ESTIMATES}.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="ESTIMATES", help=f"Estimates, with or without covariances: {ESTIMATES}.")
+    ],
     files: Reading,
     per: Annotated[
         str | None,
@@ -148,7 +150,9 @@ def correct_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Find factors for a stated covariance. Judge them on runs that chose nothing."""
+    """Find factors for a stated covariance, or variances where none is. Judge them on runs that chose nothing."""
+    from dataclasses import replace
+
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.system.folders import require_free
@@ -161,6 +165,7 @@ def correct_command(
         require_free(out, overwrite, "correction")
     if per is not None and files.align not in (None, "none", "origin"):
         raise InputError(f"--per axis: does not go with --align {files.align}, which turns the axes of the covariances")
+    files = replace(files, unstated=True)
     records = read_files(path, files)
     record = the_record(records, name).without_first(skip_asked(skip))
     texts = text_files(path, files, record.name)

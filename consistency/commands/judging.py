@@ -390,7 +390,12 @@ def monitor_command(
         float, typer.Option("--tolerance", help="Accept scales of the NIS up to this ratio; 1 is the exact test.")
     ] = 1.2,
     gate: Annotated[
-        float | None, typer.Option("--gate", help="Probability of the filter's chi-square gate, such as 0.99.")
+        str | None,
+        typer.Option(
+            "--gate",
+            metavar="P",
+            help="Judge the filter's chi-square gate, too, of this probability: 99% or 0.99.",
+        ),
     ] = None,
     mission: Annotated[
         int | None, typer.Option("--mission", help="Number of innovations of the whole mission, if known.")

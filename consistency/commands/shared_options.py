@@ -142,7 +142,7 @@ def reads_files(
     signature = inspect.signature(command, eval_str=True)
     hints = get_type_hints(Reading)
     taken = [each for each in fields(Reading) if only is None or each.name in only]
-    taken = [each for each in taken if each.name not in without]
+    taken = [each for each in taken if each.metadata and each.name not in without]
     own = {each.name: _parameter(each, hints[each.name]) for each in taken}
 
     @wraps(command)

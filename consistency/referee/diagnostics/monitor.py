@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
-from consistency.referee.defaults import GATE_FALSE_ALARM
+from consistency.referee.defaults import FALSE_ALARM, GATE_FALSE_ALARM
 from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
@@ -32,6 +32,7 @@ CAVEAT = (
 RARE = 0.05  # share of the innovations of a right filter that is called unusual
 TINY = 1e-290  # below, a distribution function is taken from its series
 WIDEST = 1e3  # scale up to which one is looked for
+DISTANT = 1e3  # noncentral chi-square, beyond which its median is taken from its series
 
 
 class _Reset(NamedTuple):
@@ -172,6 +173,7 @@ class Monitor:
     steps : calls of ``update``
     measurements : those among them with a measurement
     rejections : measurements that the gate rejected
+    refused : rejections with which the gate is judged: not those within so many innovations of another
     innovations : those that were judged
     evidence : e-value now; starts at 1
     largest : the largest so far; a right filter ever has 1 / a with probability at most a
@@ -229,7 +231,7 @@ class Monitor:
     def reset(self) -> None:
         """Restart, as after construction: the next alarm is false with probability ``false_alarm`` again."""
         count = 2 * len(RATIOS)
-        self.steps = self.measurements = self.rejections = self.innovations = 0
+        self.steps = self.measurements = self.rejections = self.innovations = self.refused = 0
         self.evidence = self.largest = 1.0
         self.alarm: Alarm | None = None
         self._nis = self._rest_nis = 0.0
@@ -280,6 +282,7 @@ class Monitor:
         self.measurements += 1
         if rejected:
             self.rejections += 1
+            self.refused += not self._skip
             self._skip = self._rest
             return None
         if self._skip:
@@ -309,6 +312,28 @@ class Monitor:
     def threshold(self) -> float:
         """The e-value of an alarm, 1 / ``false_alarm``."""
         return 1.0 / self.false_alarm
+
+    @property
+    def tried(self) -> int:
+        """Measurements with which the gate is judged: those that would be judged where it accepts them."""
+        return self.innovations + self.refused
+
+    @property
+    def gate_share(self) -> GateShare | None:
+        """What the rejections say of the gate, at a number of steps that they did not choose; None without a gate."""
+        if self.gate is None or not self.tried:
+            return None
+        return gate_share(self.refused, self.tried, self.gate)
+
+    @property
+    def smallest_spikes(self) -> dict[int, tuple[float, float]]:
+        """By dimension of the innovation, :func:`smallest_spike` at the scale found, and at the scale 1."""
+        if self.gate is None:
+            return {}
+        scale = self.scale if self._dof else 1.0
+        return {
+            dof: (smallest_spike(dof, self.gate, scale), smallest_spike(dof, self.gate)) for dof in sorted(self._bets)
+        }
 
     @property
     def ratio(self) -> float:
@@ -366,6 +391,50 @@ class Monitor:
     def _scale_since(self, reset: _Reset) -> float:
         count = self.innovations - reset.innovations
         return gated_scale((self._nis - reset.nis) / count, (self._dof - reset.dof) / count, self.gate)
+
+
+class GateShare(NamedTuple):
+    """The rejections of a gate beside those of a right filter."""
+
+    few: float  # p value that a right filter has as few, or fewer
+    many: float  # as many, or more
+    fewest: int  # measurements, of which none rejected shows that there are too few
+
+    @property
+    def finding(self) -> str:
+        """Whether there are "too few" or "too many" at half of ``FALSE_ALARM`` each; "" where neither is shown."""
+        if self.few <= 0.5 * FALSE_ALARM:
+            return "too few"
+        return "too many" if self.many <= 0.5 * FALSE_ALARM else ""
+
+
+def gate_share(refused: int, tried: int, gate: float) -> GateShare:
+    """Judge a gate that ``refused`` some of the ``tried`` measurements, of which it should reject 1 - ``gate``.
+
+    In each step, given those before, a right filter rejects with that probability, and one whose innovation covariance
+    is too large with less: whatever the steps have to do with each other, the number of rejections is stochastically at
+    most binomial. Of all bets for a number of steps that is fixed before, the binomial test wins most often (Neyman &
+    Pearson 1933). Right after a rejection the error of a right filter is larger, and steps are not tried; that this
+    keeps the rate of "too many" is measured, not proved (docs/reference/rates.md).
+    """
+    few = float(special.bdtr(refused, tried, 1.0 - gate))
+    many = float(special.bdtrc(refused - 1, tried, 1.0 - gate)) if refused else 1.0
+    return GateShare(few, many, math.ceil(math.log(0.5 * FALSE_ALARM) / math.log(gate)))
+
+
+def smallest_spike(dof: int, gate: float, scale: float = 1.0) -> float:
+    """The smallest spike that a gate rejects with probability 50 %, in true standard deviations of the innovation.
+
+    Its length sqrt(d' S^-1 d) by the true covariance S of the innovation, which is ``scale`` times the stated one. The
+    square is the noncentrality at which the noncentral chi-square has its median at the limit over the scale; far out
+    that is the limit less dof - 1. 0 where half of all innovations are rejected without a spike.
+    """
+    limit = gate_limit(gate, dof) / scale
+    if limit > DISTANT:
+        return math.sqrt(limit - dof + 1.0)
+    if special.gammainc(0.5 * dof, 0.5 * limit) <= 0.5:
+        return 0.0
+    return math.sqrt(float(special.chndtrinc(limit, dof, 0.5)))
 
 
 @dataclass(frozen=True)

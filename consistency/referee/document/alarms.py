@@ -6,9 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.monitor import CAVEAT, RARE, Alarm, GateRatios, Monitor, accepted_scales
 from consistency.referee.diagnostics.verdict.verdict import CLOCK, MICROSECOND
+from consistency.referee.diagnostics.words.numbers import p_text, percent, plural
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
+
+SHOWN = 4  # dimensions of innovations, of which the smallest spike is printed
 
 
 def monitor_document(
@@ -25,11 +29,19 @@ def monitor_document(
     start : s, the first time of the log; the sentence counts from it where the clock does not begin with the log
     """
     m = monitor
+    share = m.gate_share
     data = {
         "innovations": name, "steps": m.steps, "measurements": m.measurements, "rejected": m.rejections,
         "judged": m.innovations, "nis_ratio": m.ratio, "scale": m.scale, "evidence": m.evidence,
         "largest_evidence": m.largest, "threshold": m.threshold, "false_alarm": m.false_alarm,
         "tolerance": m.tolerance, "gate": m.gate, "mission": m.mission, "note": CAVEAT,
+        "gate_share": share and {
+            "tried": m.tried, "refused": m.refused, "expected": 1.0 - float(m.gate or 0.0), "finding": share.finding,
+            "p_few": share.few, "p_many": share.many, "fewest": share.fewest,
+        },
+        "smallest_spikes": [
+            {"dof": dof, "found": found, "right": right} for dof, (found, right) in m.smallest_spikes.items()
+        ],
         "alarm": None if alarm is None else {
             "step": alarm.step, "since": alarm.since, "t": t, "since_t": since_t, "direction": alarm.direction,
             "evidence": alarm.evidence, "scale": alarm.scale, "outlier": alarm.outlier,
@@ -64,12 +76,43 @@ def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float, s
                 t, since_t = np.round([t - start, since_t - start], MICROSECOND)
                 after = " after the start"
             sentence += f" Alarm at t = {t:.10g} s, since t = {since_t:.10g} s{after}."
-    if monitor.gate is not None and monitor.rejections:
-        sentence += (
-            f" The gate rejected {100 * monitor.rejections / monitor.measurements:.2g} % of the measurements "
-            f"(designed for {100 * (1 - monitor.gate):.2g} %), which is not judged."
+    return " ".join([sentence, *_gate(monitor)])
+
+
+def _gate(m: Monitor) -> list[str]:
+    """Whether the gate rejects as often as that of a right filter, and the smallest spike that it rejects."""
+    share = m.gate_share
+    if share is None or m.gate is None:
+        return []
+    text = f"The gate rejected {percent(m.rejections / m.measurements)} of {plural(m.measurements, 'measurement')}"
+    if m.tried < m.measurements:
+        text += f", and {percent(m.refused / m.tried)} of the {m.tried} that do not come right after a rejection"
+    text += f" (a right filter: {percent(1 - m.gate)})"
+    rate = f"at a false-alarm rate of {percent(FALSE_ALARM)}"
+    if share.finding == "too few":
+        text += (
+            f": too few (p {p_text(share.few)}, {rate}), so that the stated innovation covariance is too large, unless "
+            "the log leaves out what was rejected."
         )
-    return sentence
+    elif share.finding:
+        text += (
+            f": too many (p {p_text(share.many)}, {rate}): the stated innovation covariance is too small, or there are "
+            "outliers."
+        )
+    elif m.refused == 0:
+        text += f", which shows nothing: {share.fewest} without a rejection would show that there are too few."
+    else:
+        text += f", which is not shown to be too few or too many ({rate})."
+    spikes = []
+    for dof, (found, right) in list(m.smallest_spikes.items())[:SHOWN]:
+        is_off = np.isfinite(m.scale) and not 1.0 / m.tolerance <= m.scale <= m.tolerance
+        of_right = f" ({right:.2g} if its covariance were right)" if is_off else ""
+        spikes.append(f"{found if np.isfinite(m.scale) else right:.2g} in {dof}-D{of_right}")
+    return [
+        text,
+        f"The smallest spike that it rejects with a chance of 50 % has, in true standard deviations: "
+        f"{', '.join(spikes)}.",
+    ]
 
 
 NO_NIS = (

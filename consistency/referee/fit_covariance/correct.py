@@ -28,6 +28,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named, shown
 from consistency.referee.fit_covariance.estimation import log_densities, mean_over_runs
 from consistency.referee.fit_covariance.factors import (
+    KINDS,
     FactorBlock,
     Factors,
     Fit,
@@ -87,6 +88,7 @@ class Correction:
     verdict: Verdict = field(repr=False)  # with the uncertainty of the factors taken in
     excess: float  # what that uncertainty adds to the ratio of held-out runs
     gain: Interval  # of the log score, a step
+    assumed: bool = False  # no covariance was stated: it is I, so that factors are variances
 
     @property
     def fit(self) -> Fit:
@@ -156,18 +158,22 @@ def correct(
     held_out: str | None = None,
     per_axis: bool = False,
     names: Sequence[str] | None = None,
+    independent: bool = False,
 ) -> Correction:
     """Fit factors to the covariances that an estimator states, and judge them on runs that chose nothing.
+
+    Where none is stated it is I, and gets a factor for each component.
 
     Parameters
     ----------
     record : of :func:`consistency.read`; or errors (runs, steps, n), truth minus estimate
-    covariances : (runs, steps, n, n), beside errors
+    covariances : (runs, steps, n, n), beside errors; I where None
     axes : (n,), names of the components of errors: x, y, z; roll, pitch, yaw or heading; vx, vy, vz make up blocks
     held_out : names of runs that are judged and not fitted, with commas; "half": the second half of the runs; None:
         each run is judged by the factors of all others
     per_axis : a factor for each component, in place of one for position, attitude and velocity
     names : of the runs, for messages and ``held_out``; their numbers where None
+    independent : errors are (N, n), or (runs, steps, n), and each row is an independent run
 
     Raises
     ------
@@ -175,15 +181,17 @@ def correct(
         There is one run, or none with errors and covariances; or a name is not there.
     """
     if not isinstance(record, Record):
-        if covariances is None:
-            raise InputError("covariances: needed beside errors, (runs, steps, n, n)")
-        record = record_of_arrays({"errors": record, "covariances": covariances}, axes, "estimator", False)
+        shape = np.shape(record)
+        unit = np.broadcast_to(np.eye(shape[-1] if shape else 1), (*shape, *shape[-1:]))
+        given = {"errors": record, "covariances": unit if covariances is None else covariances}
+        record = record_of_arrays(given, axes, "estimator", independent)
+        record = replace(record, errors=replace(record.errors, assumed=covariances is None))
     require_runs(record)
     _, _, nees = stated_errors(record)
     labels = tuple(map(str, record.run_numbers if names is None else names))
     counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
-    blocks = blocks_of(record.errors.axes, record.errors.dof, per_axis)
+    blocks = blocks_of(record.errors.axes, record.errors.dof, per_axis or record.errors.assumed)
     fits = fit_groups(record.of_runs(fitted), blocks)
     place = {run: row for row, run in enumerate(fitted)}
     used = tuple(by_group(fits, place.get(run)) for run in judged)
@@ -205,6 +213,7 @@ def correct(
         verdict=verdict_of(with_uncertainty(after.record, blocks, dof)),
         excess=excess_of(after.record, blocks, dof),
         gain=mean_over_runs(run_weights(after.record) * (after.scores - before.scores)),
+        assumed=record.errors.assumed,
     )
 
 
@@ -242,7 +251,8 @@ def require_runs(record: Record) -> None:
 
         raise InputError(
             f"{record.name}: one log has no other to judge its factors by; give several runs, or cut it with --split "
-            f"auto, which takes {FEWEST} pieces or more that do not depend on each other"
+            f"auto, which takes {FEWEST} pieces or more that do not depend on each other; rows that do not, as images "
+            "or detections, are runs with --independent"
         )
     if runs == 0:
         raise InputError(f"{record.name}: no run has a step with an error and a covariance of full rank")
@@ -393,6 +403,8 @@ def correction_sentence(found: Correction) -> str:
     if found.held_out != IN_TURN:
         how = f"fitted on {plural(len(found.fitted), found.unit)}, judged on {len(found.judged)} others"
     parts = [f"{found.status} after: held-out covariance ratio {shown(before)} before and {shown(after)} after", how]
+    if found.assumed:
+        parts[0] = f"{found.status} after: none was stated; held-out covariance ratio of the one found {shown(after)}"
     if found.status == "undecided":
         decided_by = (
             f"about {plural(found.needed, found.unit)} would decide" if found.needed else found.verdict.reasons[0]
@@ -400,7 +412,7 @@ def correction_sentence(found: Correction) -> str:
         parts.append(decided_by)
     if found.status == "inconsistent":
         parts.append(f"no factor mends this: {found.verdict.reasons[0]}")
-    elif not found.is_needed:
+    elif not found.assumed and not found.is_needed:
         parts.append(f"no factor is shown to be needed, at {CONFIDENCE:.0%} for all of them together")
     return "; ".join(parts)
 
@@ -418,14 +430,18 @@ def _factors(found: Correction) -> Table:
     """A row for each block, in each group; columns of groups and floors where there are some."""
     fits = found.shown
     has_floors = any(each.high > 0.0 for fit in fits.values() for each in fit.floor)
-    is_shown = (len(found.fits) > 1, True, True, True, True, has_floors)
+    is_shown = (len(found.fits) > 1, True, not found.assumed, True, True, has_floors)
     factor_heads = Column("factor on variances"), Column("on sigmas", number=True)
+    if found.assumed:
+        factor_heads = Column("variance"), Column("sigma")
     columns = (Column("group"), Column("block"), Column("components"), *factor_heads, Column("floor, as a sigma"))
     rows = []
     for group, fit in fits.items():
         for block, factor, floor in zip(found.blocks, fit.factor, fit.floor, strict=True):
             names = " ".join(found.axes[i] for i in block.places)
             on_sigmas = f"x{short(float(np.sqrt(factor.value)))}"
+            if found.assumed:
+                on_sigmas = _sigma(factor, block.name)
             row = (group, block.name, names, shown(factor), on_sigmas, _sigma(floor, block.name))
             rows.append(tuple(compress(row, is_shown)))
     return table(tuple(compress(columns, is_shown)), rows, "Factors of each block", style="plain")
@@ -433,7 +449,7 @@ def _factors(found: Correction) -> Table:
 
 def _sigma(floor: Interval, block: str) -> str:
     """A floor as a standard deviation, with its unit where that is known."""
-    unit = UNITS.get(block, "")
+    unit = UNITS.get(next((kind for kind, axes in KINDS.items() if block in axes), block), "")
     value, low, high = np.sqrt(floor)
     return f"{value:.2g}{unit} [{low:.2g}, {high:.2g}]"
 
@@ -444,14 +460,18 @@ def _figures(found: Correction) -> Table:
     rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
     for level, stated, corrected in zip(LEVELS, before.covered(LEVELS), after.covered(LEVELS), strict=True):
         rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
-    return table(columns, rows, "Held-out errors beside the stated and the corrected covariance", style="plain")
+    is_shown = (True, not found.assumed, True, True)
+    rows = [tuple(compress(row, is_shown)) for row in rows]
+    title = "Held-out errors beside the stated and the corrected covariance"
+    return table(tuple(compress(columns, is_shown)), rows, title, style="plain")
 
 
 def correction_lines(found: Correction) -> Iterator[str]:
     """Gain of the log score, what the uncertainty of the factors does, and limits."""
     gain = found.gain
     ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
-    yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
+    if not found.assumed:
+        yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
     if len(found.fitted) < FEW and np.isfinite(found.excess):
         without = found.after.ratio.value / found.excess
         yield (
@@ -463,11 +483,21 @@ def correction_lines(found: Correction) -> Iterator[str]:
             f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "
             "their uncertainty is taken in"
         )
-    if len(found.fits) > 1 and not any(fit.factors.floor.any() for fit in found.shown.values()):
+    if found.assumed:
+        yield "the covariance is diag(variance), and the same in every step of a group"
+    elif len(found.fits) > 1 and not any(fit.factors.floor.any() for fit in found.shown.values()):
         yield "floors are 0 in all groups"
     else:
         yield from (note for fit in found.shown.values() for note in fit.notes)
+    if found.status == "inconsistent" and len(found.blocks) < len(found.axes) and _is_one_diagonal(found.before.record):
+        yield "one diagonal covariance is stated in every step; --per axis finds a variance for each component"
     yield "the factors hold for data like these; those of new conditions may be others"
+
+
+def _is_one_diagonal(record: Record) -> bool:
+    _, P, nees = stated_errors(record)
+    stated = P[np.isfinite(nees)]
+    return bool((stated == stated[0] * np.eye(record.errors.dof)).all())
 
 
 def data_of_correction(found: Correction) -> dict[str, Any]:
@@ -484,6 +514,7 @@ def data_of_correction(found: Correction) -> dict[str, Any]:
             "needed_runs": found.needed,
             "convention": found.before.record.errors.convention,
             "excess": found.excess,
+            "assumed": found.assumed,
             "log_score_gain": found.gain,
             "by": groups.column if groups is not None else None,
             "edges": groups.edges if groups is not None else None,

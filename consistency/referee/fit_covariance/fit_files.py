@@ -249,6 +249,8 @@ def write_correction(
     """
     write = partial(_write_runs, found, record, files)
     head = f"{found.status} after: P' = D P D + F, with D = diag(sqrt(factor)) and F = diag(floor) of each component."
+    if found.assumed:
+        head += " P is I, as none is stated."
     texts = {"correction.toml": toml(head, data_of_correction(found)), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
@@ -261,8 +263,9 @@ def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], fo
     held_out = dict(zip(found.before.record.run_numbers.tolist(), found.used, strict=True))
     groups = record.groups
     is_text = bool(files) and (groups is None or all(file.by_column is not None for file in files))
-    are_runs = record.runs.unit == "run"  # pieces of one log are not in its file
     runs = record.run_numbers.tolist()
+    are_known = len(files) == len(runs) or any(file.run_column is not None for file in files)
+    are_runs = record.runs.unit == "run" and are_known  # pieces and rows of one log are not told in its file
     if is_text and not are_runs:
         runs = [file.run for file in files]
     corrected = dict.fromkeys(runs, by_group(found.fits))
@@ -280,7 +283,7 @@ def _write_one(
     if not files:
         _write_archive(folder / f"{found.name}.npz", record, of_runs)
         return f"{folder.name}/{found.name}.npz"
-    change = partial(_change, found.axes, record.groups, of_runs)
+    change = partial(_change, found.axes, record.groups, of_runs, found.assumed)
     for file in files:
         if file.run_column is not None or file.run in of_runs:
             (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
@@ -289,12 +292,16 @@ def _write_one(
 
 
 def _change(
-    axes: Sequence[str], groups: Groups | None, of_runs: dict[int, ByGroup], run: int, value: str
+    axes: Sequence[str], groups: Groups | None, of_runs: dict[int, ByGroup], assumed: bool, run: int, value: str
 ) -> dict[str, tuple[float, float]] | None:
-    """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out."""
+    """Factor and floor of each component of a run by name, at a value of its column; None of a run that is left out.
+
+    Of a covariance that was ``assumed`` to be I they are 0 and its variance, whatever stands in the file.
+    """
     if run not in of_runs:
         return None
-    return of_runs[run][place_in(groups, value)].by_name(axes)
+    factors = of_runs[run][place_in(groups, value)].by_name(axes)
+    return {axis: (0.0, factor) for axis, (factor, _) in factors.items()} if assumed else factors
 
 
 def place_in(groups: Groups | None, value: str) -> int:

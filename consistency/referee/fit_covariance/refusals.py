@@ -174,9 +174,9 @@ def require_sound(windows: DriveWindows, correct: bool) -> None:
         power = f"the squared rotation error grows with the span to the power of {growth.power:.2g} (1 is white noise)"
         if _rows_are_independent(windows.drives):
             raise InputError(
-                f"{power}, and not from one row to four either: errors are independent from row to row. Detections or "
-                "fixes state the covariance of a pose: state a constant one with them, and 'consistency correct' finds "
-                "its factors. Of an odometry, loops are closed: record the live odometry, before a map corrects it"
+                f"{power}, and not from one row to four either: errors are independent from row to row. Of "
+                "detections or fixes 'consistency correct' with --independent finds the covariance. Of an odometry, "
+                "loops are closed: record the live odometry, before a map corrects it"
             )
         raise InputError(
             f"{power}: loops are closed, or a map is used, and these poses hold no increments; record the live "

@@ -44,6 +44,7 @@ def read(
     relative: str | float | None = None,
     motions: bool = False,
     windows: str | None = None,
+    independent: bool = False,
     align: str | None = None,
     lever_arm: Sequence[float] | None = None,
     split: str | int | None = None,
@@ -82,6 +83,7 @@ def read(
     relative : judge motions over windows of so many steps (100), seconds ("10s") or metres ("50m")
     motions : with ``relative``: each row is a motion with a covariance of its own, not a pose
     windows : "independent" declares errors of different windows independent, so that each is a run
+    independent : declares errors of different rows independent, as of images or calibrations, so that each is a run
     align : none, origin, posyaw, posyaw-all, se3 or se3-all: how estimates are moved into the world of the truth
     lever_arm : of a truth of positions alone: its point in the axes of the estimated body, x, y, z, m
     split : split one long log into so many pieces treated as independent runs; "auto" takes the advised number
@@ -113,8 +115,9 @@ def read(
     reading = Reading(
         truth=true, covariance=stated, error=error, state=state, covariance_order=covariance_order, max_dt=max_dt,
         time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
-        motions=motions or None, windows=windows, align=align, lever_arm=lever_arm, split=split,
-        truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
+        motions=motions or None, windows=windows, independent=independent or None, align=align,
+        lever_arm=lever_arm, split=split, truth_covariance=of_truth, truth_errors=truth_errors,
+        truth_shared=truth_shared or None,
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
         world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
@@ -160,8 +163,8 @@ def judge(
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share (Holm)
     axes : (n,) names of the components of errors
-    independent : errors are (N, n) and covariances (N, n, n), or deviations (N, n), and each row is an independent run
-        of one step
+    independent : each row is an independent run of one step. Errors may then be (N, n), with covariances (N, n, n) or
+        deviations (N, n); of a path its rows are runs
     name : of the estimator, in messages; arrays alone
     optimal_gain : True if the filter has an optimal gain and gates nothing away: its innovations are then judged
     skip : first steps (20) or seconds ("2s") of each run to leave out of the statistics, chosen on other data
@@ -190,9 +193,11 @@ def judge(
         require_truth_options(options)
         (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
-        record = read(record)
+        record = read(record, independent=independent)
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
+    elif independent:
+        raise InputError("independent: is for errors and paths; of a record, give independent=True to consistency.read")
     if by is not None or bins is not None:
         record = with_groups(record, by, bins)
     record = record.without_first(skip_asked(skip))
@@ -202,7 +207,7 @@ def judge(
 
 
 def record_text(record: Record) -> str:
-    runs, unit = plural(len(record.run_numbers), "run"), "step" if record.origin.window is None else "window"
+    runs, unit = plural(len(record.run_numbers), record.runs.unit), "step" if record.origin.window is None else "window"
     size = f"{runs} x {plural(len(record.runs.t), unit)}"
     return (
         f"<Record {record.name}: {size}, error {record.errors.convention or '-'} of {', '.join(record.errors.names)}>"

@@ -147,7 +147,7 @@ def has_one_step(record: Record) -> bool:
 
 def _span_runs(axes: Axes, record: Record) -> None:
     """Draw the axis from the first run to the last."""
-    axes.set(xlabel="run", xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
+    axes.set(xlabel=record.runs.unit, xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
 # --- errors -----------------------------------------------------------------------------------------
@@ -384,7 +384,7 @@ def _single_nees(record: Record) -> Picture | None:
     nees = record.errors.nees
     if nees is None or not np.isfinite(nees).any():
         return None
-    what, each, note = "each run", "one run", ""
+    what, each, note = f"each {record.runs.unit}", f"one {record.runs.unit}", ""
     if record.runs.independent:
         note = time_axis_of(record.runs.t).note
         what, each = f"the motion over each window of {record.origin.window or 'a step'}", "one window"
@@ -408,7 +408,7 @@ def _single_nees(record: Record) -> Picture | None:
         if wide([nees]):
             log_axis(axes, "y")
 
-    plural_of = "windows" if record.runs.independent else "runs"
+    plural_of = "windows" if record.runs.independent else f"{record.runs.unit}s"
     caption = (
         f"NEES of {what}; {record.errors.dof} is expected in the mean (line). Above is overconfident, below "
         f"conservative. Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"

@@ -82,8 +82,9 @@ def equivalence_interval(study: Judged) -> str:
 def verdicts_caption(study: Judged) -> str:
     """How large the study is, and how to read the table of verdicts."""
     text = f"{plural(study.runs, 'run')} of {plural(len(study.steps), 'step')}"
-    if _windows(study):
-        text = f"{plural(study.runs, 'window')}, each of which counts as a run"
+    for unit in UNITS:
+        if _has(unit, study):
+            text = f"{plural(study.runs, unit)}, each of which counts as a run"
     if study.single and study.has_truth:
         text += "; with one run the ANEES is the NEES of that run"
     if study.until_decided:
@@ -98,9 +99,12 @@ def verdicts_caption(study: Judged) -> str:
     return f"{text}."
 
 
-def _windows(study: Judged) -> bool:
-    """Do independent windows of logs stand in the place of runs?"""
-    return any(track.verdict.unit == "window" for track in study.tracks)
+UNITS = {"window": "Windows of a log", "row": "Rows"}  # that stand in the place of runs
+
+
+def _has(unit: str, study: Judged) -> bool:
+    """Whether units of this name stand in the place of runs."""
+    return any(track.verdict.unit == unit for track in study.tracks)
 
 
 def method(studies: Sequence[Judged]) -> str:
@@ -128,9 +132,12 @@ def method(studies: Sequence[Judged]) -> str:
             "filter that declares an optimal gain are judged: those of any other need be neither white nor of the "
             "stated size.",
         ),
-        (
-            any(_windows(study) for study in studies),
-            " Windows of a log count as runs of one step here, because their errors are declared to be independent.",
+        *(
+            (
+                any(_has(unit, study) for study in studies),
+                f" {name} count as runs of one step here, because their errors are declared to be independent.",
+            )
+            for unit, name in UNITS.items()
         ),
         (
             any(study.until_decided for study in studies),

@@ -100,6 +100,9 @@ class Reading:
         "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
     )
     windows: str | None = _option("'independent': treat each window as an independent run.")
+    independent: bool | None = _option(
+        "Treat each row, or window, as an independent run: a calibration, an image, a detection.", flag="--independent/"
+    )
     align: str | None = _option(
         "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
         "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
@@ -136,6 +139,7 @@ class Reading:
     truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
     dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
+    unstated: bool | None = None  # of no command line: the covariance is I where the files state none
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

@@ -108,6 +108,7 @@ def assemble(
     convention: str = "",
     notes: Sequence[str] = (),
     may_end: bool = False,
+    independent: bool = False,
 ) -> Record:
     """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
@@ -117,6 +118,7 @@ def assemble(
     axes : names of the components of the error
     file : where the estimates are from, for messages
     may_end : a run that ends before the others is not a sign of a broken filter
+    independent : rows are independent, so that a broken one fails alone, and the run continues
 
     Raises
     ------
@@ -130,21 +132,30 @@ def assemble(
     short = []
     skipped = 0
     longest = longest_start(tracks)
-    for track in tracks:
-        start, end, reason = judged_rows(track, longest)
-        if reason:
-            failures.append(Failure(name, track.run, int(track.column[end]) + 1, f"{reason} ({track.place[end]})"))
-        elif end and track.column[end - 1] < len(t) - 1:
-            short.append(track.run)
-        skipped += start
-        parts.append(_cut(track, start, end))
+    rows = [_soundness(track) for track in tracks] if independent else []
+    independent = any((error_ok & (kind == Validity.VALID)).any() for error_ok, kind in rows)
+    for i, track in enumerate(tracks):
+        if independent:
+            error_ok, kind = rows[i]
+            counted = error_ok & (kind == Validity.VALID)
+            broken = [(int(row), _reason(error_ok[row], kind[row])) for row in np.flatnonzero(~counted)]
+        else:
+            start, end, reason = judged_rows(track, longest)
+            counted = np.arange(end) >= start
+            broken = [(end, reason)] if reason else []
+            if not reason and end and track.column[end - 1] < len(t) - 1:
+                short.append(track.run)
+            skipped += start
+        parts.append(_cut(track, counted))
+        for row, reason in broken:
+            failures.append(Failure(name, track.run, int(track.column[row]) + 1, f"{reason} ({track.place[row]})"))
     arrays = _on_steps(parts, len(t))
     if not failures and arrays["nees"] is not None and np.isnan(arrays["nees"]).all():
         raise InputError(_singular(file, tracks, axes))
     notes = list(notes)
     if skipped:
         notes.append(f"{name}: {skipped} estimates before the covariance has full rank are left out")
-    if short and not may_end:
+    if short and not (may_end or independent):
         notes.append(
             f"{name}: {plural(len(short), 'run')} of {len(parts)} ({listed(short)}) end before step {len(t)}; "
             "if the filter broke down there, write a row of NaN, so that the failure counts"
@@ -283,12 +294,7 @@ def _first(full: Array) -> int:
 def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int, int, str]:
     """First row that is judged, first broken row, and why it is broken: ``what`` is not finite, ..."""
     rows = len(track.column)
-    error_ok = np.ones(rows, bool)
-    kind = np.zeros(rows, int)
-    if track.error is not None:
-        error_ok = finite_rows(track.error)
-    if track.covariance is not None:
-        kind = classify(track.covariance, ROUNDED)
+    error_ok, kind = _soundness(track)
     full: Array = np.asarray(kind == Validity.VALID)
     start = min(_first(full), longest)
     bad: Array = ~error_ok | ~full
@@ -296,17 +302,27 @@ def judged_rows(track: Track, longest: int, what: str = "estimate") -> tuple[int
     if not bad.any():
         return start, rows, ""
     end = int(np.argmax(bad))
-    if not error_ok[end]:
-        reason = f"{what} is not finite"
-    elif kind[end] == Validity.NOT_FINITE:
-        reason = "covariance is not finite"
-    else:
-        reason = INDEFINITE
-    return min(start, end), end, reason
+    return min(start, end), end, _reason(error_ok[end], kind[end], what)
 
 
-def _cut(track: Track, start: int, end: int) -> Track:
-    """Rows before ``end``, with their NEES from ``start`` on."""
+def _soundness(track: Track) -> tuple[Array, Indices]:
+    """Whether the error of each row is finite, and what its covariance is, (k,) both."""
+    rows = len(track.column)
+    error_ok = np.ones(rows, bool) if track.error is None else finite_rows(track.error)
+    kind = np.zeros(rows, int) if track.covariance is None else classify(track.covariance, ROUNDED)
+    return error_ok, kind
+
+
+def _reason(error_ok: bool, kind: int, what: str = "estimate") -> str:
+    """Why a row is broken."""
+    if not error_ok:
+        return f"{what} is not finite"
+    return "covariance is not finite" if kind == Validity.NOT_FINITE else INDEFINITE
+
+
+def _cut(track: Track, counted: Array) -> Track:
+    """As many rows as ``counted`` (k,) has, with the NEES of those that count."""
+    end = len(counted)
     arrays: dict[str, Any] = {}
     for key in ("column", "t", *ARRAYS):
         arrays[key] = at(getattr(track, key), slice(end))
@@ -316,10 +332,9 @@ def _cut(track: Track, start: int, end: int) -> Track:
     if error is None or P is None:
         return track
     values = np.full(end, np.nan)
-    values[start:] = nees(error[start:], P[start:])
-    if start:
-        unknown = np.full_like(P[:start], np.nan)
-        P = np.concatenate([unknown, P[start:]])
+    values[counted] = nees(error[counted], P[counted])
+    if not counted.all():
+        P = np.where(counted[:, None, None], P, np.nan)
     return replace(track, covariance=P, nees=values)
 
 

@@ -376,6 +376,7 @@ class Estimator:
     position: int = 0  # leading components of an estimate that are a position in m, to be drawn
     t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
     innovations_alone: bool = False  # there is no truth
+    assumed: bool = False  # its covariance is I, as the files state none
     failed: Mapping[int, str] = field(default_factory=dict)  # runs without estimates, and why they have none
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 

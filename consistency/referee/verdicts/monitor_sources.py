@@ -44,8 +44,12 @@ class Watched:
     evidence: Array  # (N,), e-value after each step
 
 
-def make_monitor(innovations: str | None, **options: Any) -> Monitor:
+def make_monitor(innovations: str | None, gate: str | float | None = None, **options: Any) -> Monitor:
     """A monitor by the options of the command; ``innovations`` must declare them to be those of an optimal gain.
+
+    Parameters
+    ----------
+    gate : a probability, 0.99, or a text, 99%
 
     Raises
     ------
@@ -61,7 +65,12 @@ def make_monitor(innovations: str | None, **options: Any) -> Monitor:
             "model. Of any other filter the innovations are not white, and no false-alarm rate holds"
         )
     try:
-        return Monitor(**options)
+        text = str(gate)
+        share = None if gate is None else float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError:
+        raise InputError(f"--gate {gate}: must be a probability, such as 99% or 0.99") from None
+    try:
+        return Monitor(gate=share, **options)
     except ValueError as error:
         name, rest = str(error).split(" ", 1)
         raise InputError(f"--{name.replace('_', '-')} {rest}") from None

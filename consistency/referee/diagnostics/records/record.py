@@ -87,6 +87,7 @@ class Errors:
     # indices of components whose covariance is stated, without cross terms to the other parts, which are 0 and not
     # used: each part is judged by itself. Of standard deviations alone each component is one. () where all is stated
     parts: tuple[tuple[int, ...], ...] = ()
+    assumed: bool = False  # no covariance is stated: it is I, to be corrected
     convention: str = ""  # of the error
 
     OF_RUNS: ClassVar = ("error", "covariance", "nees")
@@ -115,7 +116,7 @@ class Runs:
     """What the rows and columns of the arrays are: runs and their steps."""
 
     numbers: Indices | None = None  # (runs,), what to call the runs; 0, 1, ... otherwise
-    unit: str = "run"  # what a run is called: a "window" where a log is cut into independent ones
+    unit: str = "run"  # what a run is called: a "row" or "window" where those are independent, a "piece" of a log
     t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
     by: Array | None = None  # (runs, steps), values of a column; of words their numbers. NaN where there is none
@@ -310,26 +311,27 @@ class Record:
 
     @property
     def as_runs(self) -> Record:
-        """Independent windows as runs of a single step, numbered from 1; those without an error are none."""
+        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none.
+
+        Runs of one step keep their numbers.
+        """
         if not self.runs.independent:
             return self
-        errors = self.errors
-        assert errors.error is not None
-        assert errors.covariance is not None
-        assert errors.nees is not None
-        runs, steps = errors.error.shape[:2]
-        there = np.isfinite(errors.nees)
-        number = np.arange(1, runs * steps + 1).reshape(runs, steps)
-        failures = [(int(np.flatnonzero(self.run_numbers == f.run)[0]), f) for f in self.failures]
-        for row, f in failures:
-            there[row, f.step - 1] = True
-        return Record(
-            self.name,
-            replace(_changed(errors, lambda array: array[there][:, None]), convention=""),
-            runs=Runs(number[there], "window", skipped=self.runs.skipped),
-            failures=tuple(replace(f, run=int(number[row, f.step - 1]), step=1) for row, f in failures),
-            groups=None if self.groups is None else self.groups[there, None],
-        )
+        judged = [values for values in (self.errors.nees, self.innovations.nis) if values is not None]
+        there = np.any([np.isfinite(values) for values in judged], axis=0)
+        number = np.arange(1, there.size + 1).reshape(there.shape)
+        unit = "row" if self.origin.window is None else "window"
+        if there.shape[1] == 1 and unit == "row":
+            number = self.run_numbers[:, None]
+        rows = [int(np.flatnonzero(self.run_numbers == f.run)[0]) for f in self.failures]
+        at = [(row, f.step - 1) for row, f in zip(rows, self.failures, strict=True)]
+        for place in at:
+            there[place] = True
+        failed = (replace(f, run=int(number[place]), step=1) for place, f in zip(at, self.failures, strict=True))
+        unnumbered = replace(self, runs=replace(self.runs, numbers=None))
+        found = unnumbered.changed(lambda array: array[there][:, None])
+        runs = Runs(number[there], unit, np.full(1, np.nan), found.runs.times, found.runs.by, skipped=self.runs.skipped)
+        return replace(found, runs=runs, failures=tuple(failed), origin=replace(found.origin, files={}))
 
     @property
     def left_out_steps(self) -> list[int]:

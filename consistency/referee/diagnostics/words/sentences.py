@@ -43,6 +43,7 @@ FEWEST = 8  # runs; fewer true starts may be near each other by chance
 SAME = 0.1  # of the stated variance of the position, which that of true starts drawn from it exceeds
 LESS = 0.5  # of the median of all steps, that the NEES of the first one is at most
 ROUNDING = 1e-9  # of the extent of a path
+MEMORYLESS = 1.5  # steps, over which errors decorrelate whose rows may be independent
 
 
 def reasons(v: Findings) -> list[str]:
@@ -314,7 +315,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     elif v.location is not None:
         lines.append(_level(v, s, v.location))
     if not v.faults:
-        lines += _two_intervals(s)
+        lines += _two_intervals(s, v.unit)
     worst = clear(v.worst_axis)
     of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
@@ -343,7 +344,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     return lines
 
 
-def _two_intervals(s: Scale) -> list[str]:
+def _two_intervals(s: Scale, unit: str) -> list[str]:
     """That the interval of the tests is not that of the ratio, where it is the wider one at the lower level."""
     tests = s.equivalence.interval
     if tests is None or s.equivalence.one_sided or not s.inflation.high > 0.0:
@@ -352,8 +353,8 @@ def _two_intervals(s: Scale) -> list[str]:
     if (tests[0] >= low and tests[1] <= high) or is_uncertain(s.inflation):
         return []
     return [
-        f"95 % interval {short(low)} to {short(high)} by the spread between these runs; that of the two tests is wider "
-        "where it also holds if the covariance is right in some runs only"
+        f"95 % interval {short(low)} to {short(high)} by the spread between these {unit}s; that of the two tests is "
+        "wider where it also holds if the covariance is right in some runs only"
     ]
 
 
@@ -417,6 +418,8 @@ def _ratio_within(w: Within, steps: int, undecided: bool) -> str:
     )
     if not undecided or w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
         return text
+    if w.steps <= steps and w.correlation < MEMORYLESS:
+        text += "; if rows do not depend on each other, as images or detections, --independent makes each a run"
     if w.steps <= steps:
         return f"{text}; cut into {w.pieces} runs, this log would then probably decide"
     return f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"

@@ -98,10 +98,13 @@ def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
 
 def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
+    own = arrays.get("errors", arrays.get("estimates"))
+    if r.unstated and "covariances" not in arrays and own is not None:
+        arrays = {**arrays, "covariances": np.broadcast_to(np.eye(own.shape[-1]), (*own.shape, own.shape[-1]))}
     archive = Archive(path, arrays)
     kind = _kind(archive, r)
     if kind == OF_NEES:
-        found = _of_nees(archive)
+        found = _of_nees(archive, bool(r.independent))
         assert found.errors.nees is not None
         return replace(found, runs=replace(found.runs, by=archive.groups(r, found.errors.nees.shape)))
     declared = ""
@@ -251,8 +254,11 @@ def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Ite
         yield beside if known.all() else beside.beside(np.flatnonzero(known))
 
 
-def _of_nees(archive: Archive) -> Record:
-    """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure."""
+def _of_nees(archive: Archive, independent: bool) -> Record:
+    """NEES without errors: NaN before the first value is a start known exactly, NaN later a failure.
+
+    Of ``independent`` rows any NaN is the failure of its own.
+    """
     path = archive.path
     nees = archive.array("nees", 2).copy()
     dof = archive.whole_numbers("dof", nees.shape)
@@ -271,17 +277,17 @@ def _of_nees(archive: Archive) -> Record:
     nees[~known] = np.nan
     for run in range(runs):
         finite = np.isfinite(nees[run])
-        begun = np.logical_or.accumulate(finite) | ~finite.any()
+        begun = np.logical_or.accumulate(finite) | ~finite.any() | independent
         broken = np.flatnonzero(begun & known[run] & ~finite)
-        if len(broken):
-            step = int(broken[0])
-            nees[run, step:] = np.nan
-            failures.append(Failure(path.stem, run, step + 1, "NEES is not finite"))
+        if len(broken) and not independent:
+            nees[run, broken[0] :] = np.nan
+            broken = broken[:1]
+        failures += [Failure(path.stem, run, int(step) + 1, "NEES is not finite") for step in broken]
     return Record(
         path.stem,
         Errors(nees=nees, dof=n, axes=archive.axes(n)),
         InnovationRecord(nis, nis_dof),
-        Runs(np.arange(runs), t=archive.times(steps)),
+        Runs(np.arange(runs), t=archive.times(steps), independent=independent),
         tuple(failures),
         fit=fit,
     )

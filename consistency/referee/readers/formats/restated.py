@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.readers.formats.columns import covariance_columns, pose_columns
+from consistency.referee.readers.formats.columns import covariance_columns, entry_name, pose_columns
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
     fields_of,
@@ -54,6 +54,7 @@ class TextFile:
     filter_column: int | None = None  # with the estimator of each line
     filter: str = ""  # whose lines are written
     by_column: int | None = None  # with the value of --by of each line
+    added: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # by name, to files that state none: as entries
 
     def restated(self, change: Change) -> str:
         """The text with each covariance P as D P D + F, by the factors and floors of its run; without runs of None."""
@@ -62,6 +63,8 @@ class TextFile:
         head = head_of(self.path)
         first = 0 if head is None else head.line
         text = lines[:first]
+        if head is not None and not head.comment and self.added:
+            text[-1] = _with(text[-1], self.added)
         for line in lines[first:]:
             text.append(self._line(line, change))
         return "".join(text)
@@ -82,8 +85,9 @@ class TextFile:
         restated = self._fields(parts[::2], change)
         if not restated:
             return ""
-        parts[::2] = restated
-        return line.replace(text, "".join(parts), 1)
+        many = len(parts[::2])
+        parts[::2] = restated[:many]
+        return _with(line.replace(text, "".join(parts), 1), restated[many:])
 
     def _fields(self, fields: list[str], change: Change) -> list[str]:
         """Fields of a line with its covariance restated; none where its run or estimator is left out."""
@@ -103,7 +107,7 @@ class TextFile:
         for column, (a, b) in self.entries.items():
             if bare[column]:
                 restated[column] = repr(self._number(float(bare[column]), a, b, factors))
-        return restated
+        return restated + [repr(self._number(0.0, a, b, factors)) for a, b in self.added.values()]
 
     def _number(self, value: float, a: str, b: str, factors: Factors) -> float:
         """A number of the covariance of two components, restated."""
@@ -113,6 +117,13 @@ class TextFile:
             return float(np.sqrt(factor * value * value + floor))
         product = value * float(np.sqrt(factor * other))
         return product + floor if a == b else product
+
+
+def _with(line: str, fields: Iterable[str]) -> str:
+    """A line with fields behind its own, which are separated as these are."""
+    text = line.rstrip("\r\n")
+    separator = max(",;\t", key=text.count)
+    return (separator if separator in text else " ").join([text, *fields]) + line[len(text) :]
 
 
 def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
@@ -148,7 +159,12 @@ def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFil
         return None
     axes = r.state or POSE
     covariance = covariance_columns(head.names, axes)
-    if not covariance.places:
+    added = {}
+    for i, j in itertools.combinations_with_replacement(range(len(axes)), 2):
+        added[entry_name(axes, i, j)] = (axes[i], axes[j])
+    if covariance.places:
+        added = {}
+    elif not r.unstated or head.comment or not set(axes) <= set(head.names):
         return None
     components = {place: (axes[i], axes[j]) for (i, j), place in covariance.places.items()}
     places = {column: place for place, column in enumerate(head.names)}
@@ -157,7 +173,8 @@ def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFil
         run_column = places.get("run")
     if r.by is not None and r.by_file is None:
         by_column = places.get(r.by)
-    return TextFile(path, components, covariance.squared, run or 0, run_column, places.get("filter"), name, by_column)
+    squared = covariance.squared or bool(added)
+    return TextFile(path, components, squared, run or 0, run_column, places.get("filter"), name, by_column, added)
 
 
 def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:
@@ -180,6 +197,8 @@ def _numbers(path: Path, first: int, run: int, r: Reading) -> TextFile | None:
                 width = len(fields_of(line))
                 break
     many = width - first
+    if many == 0 and r.unstated:
+        return TextFile(path, {}, True, run, added={f"P {a} {b}": (a, b) for a in STATE[:6] for b in STATE[:6]})
     if many not in (6, TRIANGLE, FULL):
         return None
     return _of_columns(path, range(first, width), run, r, many != 6)

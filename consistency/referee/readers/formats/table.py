@@ -255,7 +255,7 @@ def _estimator(
     notes = _absent(name, truth, runs, true_runs)
     stated = WHOLE
     cross = of_truth = None
-    if not poses_alone:
+    if not poses_alone and (not r.unstated or covariance_columns(list(sheet.data), axes).places):
         covariance, stated, note = _covariance(name, sheet, axes, convention)
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])

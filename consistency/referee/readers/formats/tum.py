@@ -238,7 +238,10 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
         return replace(fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), by=by), ""
     k, note = judged_rest(own, true, r)
     order = r.covariance_order or ORDERS[0]
-    P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
+    P, known = unstated(len(own.t), 6 + k)
+    cross = None
+    if not r.unstated or run.covariance is not None or stated_as.covariances_in(own, order) is not None:
+        P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
     of_truth = _of_truth(true, own, order, r)
     run = replace(run, own=own.of(slice(0, POSE_NUMBERS)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
@@ -293,7 +296,10 @@ def _covariances(
         of = f"lines of t and {FULL} numbers, or name its columns: --columns 'P*=NAME*'"
         if isinstance(own, States):
             of = f"the standard deviations of {DEVIATIONS_LAYOUT}"
-        raise InputError(f"{own.path}: holds no covariance; give --covariance FILE, {of}")
+        raise InputError(
+            f"{own.path}: holds no covariance; give --covariance FILE, {of}; where none is stated, 'consistency "
+            "correct' finds one"
+        )
     if P is not None:
         raise InputError(f"--covariance {path}: {own.path} holds covariances already; give one of them")
     if isinstance(own, States):

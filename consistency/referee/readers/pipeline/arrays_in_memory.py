@@ -42,6 +42,8 @@ def record_of_arrays(
     first = next(iter(given))
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
+        if arrays["errors"].ndim == 3:  # of runs whose steps are independent, too
+            arrays = {key: array.reshape(-1, *array.shape[2:]) for key, array in arrays.items()}
         _require_rows({key: array.shape for key, array in arrays.items()})
         arrays = {key: array[:, None] for key, array in arrays.items()}
     if first == "errors" and "covariances" in arrays:
@@ -92,7 +94,13 @@ def record_of_arrays(
     if sigma is not None:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
-    return replace(record, name=require_name(name, "name"), failures=failures)
+    runs = replace(record.runs, independent=independent)
+    record = replace(record, name=require_name(name, "name"), failures=failures, runs=runs)
+    if not independent:
+        return record
+    from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
+
+    return rows_as_runs(record)
 
 
 def _in_python(message: str, deviations: bool) -> str:

@@ -283,6 +283,10 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
         from consistency.referee.readers.truth_covariance import declared
 
         records = declared(records, r)
+    if r.independent and r.relative is None:
+        from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
+
+        return [rows_as_runs(record) for record in records]
     pieces = pieces_asked(r)
     if pieces is None:
         return records
@@ -355,7 +359,8 @@ def pieces_asked(r: Reading) -> int | None:
     """
     if r.split is None:
         return None
-    r.refuse("--split", dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows"))
+    others = dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows")
+    r.refuse("--split", others | {"independent": ", with which each row is a run already"})
     if r.align not in (None, "none"):
         raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
     if r.split == "auto":
@@ -399,4 +404,6 @@ def checked_options(r: Reading) -> Reading:
     if r.relative is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
+    if r.independent and align is not None:
+        raise InputError(f"--independent: does not go with --align {align}: all rows would share the error of a frame")
     return replace(r, time_offset=offset, align=align)

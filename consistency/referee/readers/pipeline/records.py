@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from consistency.referee.readers.runs_to_record import Relative
 
 OF_WINDOWS = ("relative", "motions", "windows")  # options
+INDEPENDENT = "independent"  # value of the last of them
 BENT = 0.2  # sigma: adds its square, 0.04, to a NEES, which a thousand runs would just see
 FAR = 1.0  # rad; a median rotation error beyond it is a matter of conventions, not of an estimator
 
@@ -57,7 +58,9 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
     if e.innovations_alone and r.by is None:
-        return [_innovations(e)]
+        return [_innovations(e, bool(r.independent))]
+    if r.unstated:
+        e = with_unit_covariances(e)
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
     if r.by is None:
@@ -68,6 +71,23 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     e, column = with_values(e, r, judged)
     records, pairs = _records(e, judged, r)
     return in_groups(records, column, e, pairs, r)
+
+
+def with_unit_covariances(e: Estimator) -> Estimator:
+    """The estimator with covariances I, and a note, where none is stated; itself otherwise.
+
+    Zeros state none, and neither does one multiple of I in every row of poses, whose units differ.
+    """
+    first = next((p.covariance[p.stated][0] for p in e.runs if p.stated.any()), np.zeros((1, 1)))
+    placeholder = first[0, 0] * np.eye(len(first)) if e.runs[0].manifold != "vector" else np.zeros((1, 1))
+    if not all((p.covariance[p.stated] == placeholder).all() for p in e.runs):  # NaN is stated, too: a failure
+        return e
+    runs = []
+    for p in e.runs:
+        unit = np.broadcast_to(np.eye(p.covariance.shape[-1]), p.covariance.shape)
+        runs.append(replace(p, covariance=unit, stated=np.ones(len(p.t), bool)))
+    note = f"{e.said}: states no covariance; it is taken as I, which a factor for each component corrects"
+    return replace(e, runs=runs, stated=WHOLE, notes=(*e.notes, note), assumed=True)
 
 
 def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
@@ -84,7 +104,8 @@ def windows_asked(r: Reading) -> Relative | None:
         return None
     from consistency.referee.readers.runs_to_record import relative_of
 
-    return relative_of(r.relative, bool(r.motions), r.windows)
+    windows = INDEPENDENT if r.independent and r.relative is not None else r.windows
+    return relative_of(r.relative, bool(r.motions), windows)
 
 
 def _judged(e: Estimator, r: Reading) -> list[int]:
@@ -153,8 +174,15 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
             continue
         some = [track.part(part) for track in tracks]
         axes = tuple(e.axes[i] for i in part)
-        record = assemble(f"{e.name}{ending}", some, t, axes, str(e.covariances or e.path), e.convention, notes)
-        record = replace(record, fit=fit, origin=replace(record.origin, files=files, causes=tuple(causes)))
+        file, rows = str(e.covariances or e.path), bool(r.independent)
+        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
+        record = replace(
+            record,
+            errors=replace(record.errors, assumed=e.assumed),
+            runs=replace(record.runs, independent=rows),
+            fit=fit,
+            origin=replace(record.origin, files=files, causes=tuple(causes)),
+        )
         if e.stated.alone:
             record = each_alone(record)
         records.append(record)
@@ -300,7 +328,7 @@ def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[
 
 def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Hints on mix-ups, which are loaded where the errors do not fit."""
-    if is_plausible(runs, shift, judged):
+    if e.assumed or is_plausible(runs, shift, judged):
         return []
     from consistency.referee.readers.mix_ups.hints import hints
 
@@ -366,7 +394,7 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     return in_columns(some, columns), t, notes
 
 
-def _innovations(e: Estimator) -> Record:
+def _innovations(e: Estimator, independent: bool) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
@@ -374,8 +402,9 @@ def _innovations(e: Estimator) -> Record:
         tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes)
-    return replace(record, errors=replace(record.errors, error=None, dof=0))
+    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes, independent=independent)
+    errors = replace(record.errors, error=None, dof=0)
+    return replace(record, errors=errors, runs=replace(record.runs, independent=independent))
 
 
 def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative: Relative) -> Record:

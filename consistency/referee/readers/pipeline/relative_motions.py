@@ -25,11 +25,12 @@ from consistency.referee.types import Array, Indices
 
 KIND = "left"
 DOUBTS = {  # by whether sizes of errors depend on each other, and whether they are alike: what they do, and its cause
-    (True, True): ("are of like size", "conditions that last longer than a window"),
-    (True, False): ("are of unlike size", "what takes turns from window to window"),
-    (False, True): ("go the same way", "a bias, or noise that lasts longer than a window"),
+    (True, True): ("are of like size", "conditions that last longer than a {0}"),
+    (True, False): ("are of unlike size", "what takes turns from {0} to {0}"),
+    (False, True): ("go the same way", "a bias, or noise that lasts longer than a {0}"),
     (False, False): ("go opposite ways", "noise of the pose that they share"),
 }
+DOUBTED = "the {} do not seem to be independent, on which this rests"
 SEARCHED = 20_000  # rows with truth, of all runs, in which mix-ups are looked for
 BENT = 0.1  # rad: sigma of a rotation over a window, from which first order errs (benchmarks/relative_poses.py)
 
@@ -172,7 +173,7 @@ def relative_recording(
     notes = _notes(name, found, len(axes), runs[0].convention, relative)
     of = independence(np.concatenate(whitened))
     if relative.independent and of.doubtful:
-        notes.append(_doubt(name, of, relative))
+        notes.append(_doubt(name, of, "window", _whose(relative)))
     names = tuple(axes[i] for i in judged)
     record = assemble(name, tracks, t, names, file, KIND, notes, may_end=relative.independent)
     record = replace(
@@ -184,7 +185,7 @@ def relative_recording(
         return record
     caption = ""
     if of.doubtful:
-        caption = f"the {_whose(relative)} do not seem to be independent, on which this rests"
+        caption = DOUBTED.format(_whose(relative))
     return replace(
         record,
         fit=replace(record.fit, caption=caption),
@@ -240,12 +241,25 @@ def _widest(found: Sequence[Windows]) -> float:
     return float(np.median(np.sqrt(np.maximum(largest, 0.0))))
 
 
-def _doubt(name: str, of: Independence, relative: Relative) -> str:
-    """Note that windows are correlated, positively or negatively, though they are declared to be independent."""
+def rows_as_runs(record: Record) -> Record:
+    """The record with each row a run, as ``--independent`` declares, noted where neighbours seem to be dependent."""
+    note = f"{record.name}: errors of different rows are declared to be independent: each is a run"
+    rows = record.as_runs.with_notes(note)
+    if rows.errors.error is None or rows.errors.covariance is None:
+        return rows
+    of = independence(whiten(rows.errors.error, rows.errors.covariance)[:, 0])
+    if not of.doubtful:
+        return rows
+    doubted = replace(rows, fit=replace(rows.fit, caption=rows.fit.caption or DOUBTED.format("rows")))
+    return doubted.with_notes(_doubt(record.name, of, "row", "rows"))
+
+
+def _doubt(name: str, of: Independence, unit: str, whose: str) -> str:
+    """Note that rows or windows are correlated, of either sign, though they are declared to be independent."""
     way, cause = DOUBTS[bool(of.of_sizes), bool(of.alike)]
     return (
-        f"{name}: errors of neighbouring windows {way} (p {p_text(of.p_value)}), so that they do not seem to be "
-        f"independent: {cause} may be behind it, and the verdict holds for independent {_whose(relative)} only"
+        f"{name}: errors of neighbouring {unit}s {way} (p {p_text(of.p_value)}), so that they do not seem to be "
+        f"independent: {cause.format(unit)} may be behind it, and the verdict holds for independent {whose} only"
     )
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 INDEFINITE = "covariance is not positive definite"  # why a run failed
 FORMS = "a whole number of steps (20) or seconds (2s)"
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
+TINIEST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,40 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
+class Ensemble(NamedTuple):
+    """Members of all runs and steps, as they are drawn."""
+
+    members: int
+    spread: Array  # (k, n), variances of the members of k steps
+    square: Array  # (k, n), squares of truth less mean of the members
+
+
+class RatioTable(NamedTuple):
+    """What the mean square of a normal number is where the truth spreads more than stated, or less.
+
+    A rank among a few members, say, cannot show how far outside the truth lies.
+    """
+
+    true: Array  # (k,), ratios of true to stated covariance, increasing
+    shown: Array  # (k,), mean squares, which do not decrease: 1 at the ratio 1
+
+    def mean_square(self, ratio: float) -> float:
+        """Mean square of the numbers at a true ratio."""
+        return float(np.exp(np.interp(np.log(max(ratio, TINIEST)), np.log(self.true), np.log(self.shown))))
+
+    def factor(self, factor: float) -> float:
+        """The largest factor whose mean squares, up and down, are true ratios within ``factor``."""
+        return min(self.mean_square(factor), 1.0 / self.mean_square(1.0 / factor))
+
+    def ratio(self, mean_square: float) -> float:
+        """The true ratio behind a mean square: 0 or infinite where none shows so little, or so much."""
+        if mean_square <= self.shown[0]:
+            return 0.0
+        if mean_square >= self.shown[-1]:
+            return float("inf")
+        return float(np.exp(np.interp(np.log(mean_square), np.log(self.shown), np.log(self.true))))
+
+
 @dataclass(frozen=True, repr=False)
 class Record:
     """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
@@ -113,6 +148,10 @@ class Record:
     unavailable: Collection[str] = ()  # questions that cannot be answered after the fit, which are not asked
     unseen: float = 0.0  # share of the NEES that the fit may have absorbed: consistent is shown with it added
 
+    # errors that are normal numbers, as ranks among members are
+    tables: Sequence[RatioTable] = ()  # (n,), what their mean squares say of the covariance; () of other errors
+    ensemble: Ensemble | None = None  # what is drawn of it
+
     # origin
     t: Array = field(default_factory=lambda: np.empty(0))  # (steps,), s; NaN where runs have no common clock
     times: Array | None = None  # (runs, steps), s, of the steps of each run, or of the beginnings of windows
@@ -150,6 +189,14 @@ class Record:
             return self.runs
         there = (self.error, self.nees, self.nis, self.innovations)
         return np.arange(next((len(array) for array in there if array is not None), 0))
+
+    def table(self, index: Sequence[int] | None = None) -> RatioTable | None:
+        """What mean squares of some components together say of the covariance, or of all; None if they are its."""
+        some = [self.tables[i] for i in range(len(self.tables)) if index is None or i in index]
+        if not some:
+            return None
+        ratios = some[0].true
+        return RatioTable(ratios, np.mean([[one.mean_square(ratio) for ratio in ratios] for one in some], axis=0))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.options import OF_AXES, Reading, flag_of
+from consistency.referee.readers.options import GROUPED, OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
@@ -45,7 +45,7 @@ NO_GUESS = {
     "relative": ", which judges motions in one error; name the conventions one by one",
 }
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
-OF_BAGS = ("topic", "truth_topic")
+OF_BAGS = ("members", "topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
 OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
@@ -156,7 +156,12 @@ def found_in(estimates: Path, r: Reading) -> Found:
     if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
         raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
     kind = kind_of(estimates, r)
-    refuse_options(estimates, r, *(OF_BAGS if kind is None else kind.refused))
+    of_truth = r
+    if r.repeats:
+        of_truth = replace(r, truth=None)
+        if kind is not None and kind.read not in (_archive, _tables):
+            raise InputError(f"--truth repeats: is for tables and archives of runs of the same values, not {estimates}")
+    refuse_options(estimates, of_truth, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
         raise unknown_kind(estimates)
     if r.truth is not None and is_foreign(r.truth):
@@ -283,6 +288,13 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
         from consistency.referee.readers.truth_covariance import declared
 
         records = declared(records, r)
+    if r.repeats or r.ensemble is not None:
+        from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
+
+        if r.repeats:
+            records = [of_repeats(record) for record in records]
+        if r.ensemble is not None:
+            records = [of_ensemble(record, r.ensemble) for record in records]
     pieces = pieces_asked(r)
     if pieces is None:
         return records
@@ -385,6 +397,13 @@ def checked_options(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    if r.repeats:
+        why = ": repeats have no truth, and each run is compared with those before"
+        r.refuse(
+            "--truth repeats", dict.fromkeys((*OF_WINDOWS, *OF_TRUTH, *GROUPED, "align", "split", "time_offset"), why)
+        )
+    if r.ensemble is not None and r.given(OF_TRUTH):
+        raise InputError(f"--ensemble: does not go with {flag_of(r.given(OF_TRUTH)[0])}, of a Gaussian error")
     for name in ("by_file", "bins"):
         if r.given([name]) and r.by is None:
             raise InputError(f"{flag_of(name)}: goes with --by COLUMN")

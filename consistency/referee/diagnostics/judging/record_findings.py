@@ -315,7 +315,8 @@ def _of_covariance(parts: ErrorParts, record: Record, sample: Sample | None, set
     def of(mean_square: Interval, key: str) -> Interval:
         table = tables[key]
         assert table is not None
-        return Interval(*map(table.ratio, mean_square))
+        value, low, high = map(table.ratio, mean_square)
+        return Interval(min(value, float(table.true[-1])), low, high)
 
     def shown(found: Equivalence) -> Equivalence:
         interval = None
@@ -326,6 +327,11 @@ def _of_covariance(parts: ErrorParts, record: Record, sample: Sample | None, set
     found = parts.with_ratios(of)
     if found.scale is not None:
         found = found._replace(scale=replace(found.scale, equivalence=shown(found.scale.equivalence)))
+    if found.accuracy is not None:  # numbers have no units
+        none = float("nan")
+        rmse = np.full_like(found.accuracy.rmse, none)
+        accuracy = replace(found.accuracy, rmse=rmse, rmse_position=none, rmse_heading=none)
+        found = found._replace(accuracy=accuracy)
     if found.by_group is not None:
         groups = tuple(replace(group, equivalence=shown(group.equivalence)) for group in found.by_group.groups)
         found = found._replace(by_group=replace(found.by_group, groups=groups))

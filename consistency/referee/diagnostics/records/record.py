@@ -97,9 +97,7 @@ class RatioTable(NamedTuple):
         return min(self.mean_square(factor), 1.0 / self.mean_square(1.0 / factor))
 
     def ratio(self, mean_square: float) -> float:
-        """The true ratio behind a mean square: 0 or infinite where none shows so little, or so much."""
-        if mean_square <= self.shown[0]:
-            return 0.0
+        """The true ratio behind a mean square: the smallest, or infinite, where none shows so little, or so much."""
         if mean_square >= self.shown[-1]:
             return float("inf")
         return float(np.exp(np.interp(np.log(mean_square), np.log(self.shown), np.log(self.true))))

@@ -50,6 +50,8 @@ def of_members(e: Estimator, r: Reading) -> Estimator:
     first = e.runs[0].members
     assert first is not None
     m, n = first.shape[1:]
+    if m < 2:
+        raise InputError(f"{e.path}: members: a rank beside 1 member does not show its size; give 2 or more, better 20")
     axes = tuple(e.axes)
     notes = [
         f"{e.said}: errors are normal numbers at the rank of the truth among {plural(m, 'member')}, random within it "

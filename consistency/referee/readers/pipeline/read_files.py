@@ -51,7 +51,12 @@ OF_TABLES = ("dof", "members")
 OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
-ARCHIVE_KEYS = {"truth": "truth", "members": "members", "axes": "axes", "truth_covariance": "truth_covariances"}  # in place of options
+ARCHIVE_KEYS = {
+    "truth": "truth",
+    "members": "members",
+    "axes": "axes",
+    "truth_covariance": "truth_covariances",
+}  # in place of options
 PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
 Found = Sequence[Estimator | Record]
 
@@ -133,7 +138,9 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
     Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES), _bags),
-    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(
+        _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive
+    ),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
     Kind(_is_trajectory, (*OF_BAGS, "state", *OF_TABLES), _trajectories),

@@ -479,9 +479,9 @@ def _ranks(record: Record) -> Picture | None:
         )
 
     caption = (
-        "Share of the truths in each rank among the members: flat if both are exchangeable, high at both ends if members "
-        "spread too little, high in the middle if too much, a slope where they are biased. Shaded: where all ranks of a "
-        "component lie with 95 % if members are right, by the spread between runs."
+        "Share of the truths in each rank among the members: flat if both are exchangeable, high at both ends if "
+        "members spread too little, high in the middle if too much, a slope where they are biased. Shaded: where all "
+        "ranks of a component lie with 95 % if members are right, by the spread between runs."
     )
     return Picture("Ranks among the members", caption, (paint,), height=1.9)
 
@@ -510,7 +510,8 @@ def _spread_and_skill(record: Record) -> Picture | None:
 
     caption = (
         "Root mean square of the error of the mean of m members, in tenths of the steps by their spread, against that "
-        "spread times the root of 1 + 1/m, both over the mean spread. On the diagonal members spread as they err."
+        "spread times the root of 1 + 1/m, both over the mean spread. On the diagonal members spread as they err; the "
+        "spread of few members is partly chance, which makes the line flatter."
     )
     return Picture("Spread and skill", caption, (paint,), height=2.1)
 

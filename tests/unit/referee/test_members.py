@@ -294,9 +294,8 @@ def test_files_of_members_are_judged_as_arrays_are(tmp_path):
     record = cs.read(tmp_path / "m.csv", members={"x": "a*", "y": "b*", "z": "c*"})
     assert list(record.axes) == ["x", "y", "z", TOGETHER]
     assert cs.judge(record).p_value == pytest.approx(verdict.p_value)
-    np.savez(
-        tmp_path / "e.npz", **dict(zip(("errors", "covariances"), mean_and_covariance(truth, members), strict=True))
-    )
+    e, P = mean_and_covariance(truth, members)
+    np.savez(tmp_path / "e.npz", errors=e, covariances=P)
     (ensemble,) = read_recordings(tmp_path / "e.npz", Reading(ensemble=6))
     assert cs.judge(ensemble).p_value == cs.judge(e, P, ensemble=6).p_value
 

@@ -58,6 +58,7 @@ MODULES = (
     "calibration_spread",
     "calibration_groups",
     "calibration_independent",
+    "calibration_members",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

@@ -18,7 +18,8 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import summary
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.formats.archives import UNWEIGHTED
+from consistency.referee.readers.options import REPEATS, Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
@@ -61,6 +62,8 @@ def read(
     truth_world: str | None = None,
     truth_body_axes: str | None = None,
     dof: int | None = None,
+    members: Mapping[str, str] | None = None,
+    ensemble: int | None = None,
     filter: str | None = None,
 ) -> Record:
     """Read files of another estimator, as ``consistency analyse FILES`` does; docs/files.md has the formats.
@@ -69,7 +72,8 @@ def read(
     ----------
     estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run; or a table in
         memory, as a DataFrame, with the columns of a .csv
-    truth : of the same kind, or the folder of a KITTI drive; not with .npz
+    truth : of the same kind, or the folder of a KITTI drive; not with .npz. "repeats": all runs have the same true
+        values, and there is no truth
     covariance : of a TUM trajectory: t and 36 or 21 numbers
     error : error that the covariance describes: so2, vector, left, right, so3, so3-body, rvec or euler; None is
         the default, and "guess" judges all that poses have
@@ -101,6 +105,8 @@ def read(
     world, body_axes, truth_world, truth_body_axes : axes of each file, a letter each: "enu" or "ned"; "flu" or "frd".
         A pose maps from its body axes to its world axes
     dof : degrees of freedom of each NIS of a table that has no column of them
+    members : columns of a table that hold members of an ensemble: ``{"x": "e*"}``, all that begin with e
+    ensemble : number of members whose mean and sample covariance the files state
     filter : which estimator, where the files hold several
 
     Raises
@@ -121,6 +127,7 @@ def read(
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
         world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
+        members=members, ensemble=ensemble,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates
@@ -134,10 +141,13 @@ def read(
 
 
 def judge(
-    record: Record | str | Path | ArrayLike,
+    record: Record | str | Path | ArrayLike | None = None,
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
+    members: ArrayLike | None = None,
+    truth: ArrayLike | str | None = None,
+    ensemble: int | None = None,
     axes: Sequence[str] | None = None,
     independent: bool = False,
     name: str = "estimator",
@@ -162,6 +172,11 @@ def judge(
     covariances : (runs, steps, n, n), beside errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share (Holm)
+    members : (runs, steps, m, n), in place of errors: draws that are exchangeable with the truth if they are right, as
+        those of an ensemble or of equally weighted particles; whatever their distribution. Needs ``truth``
+    truth : (runs, steps, n), of members; or "repeats": ``record`` holds estimates (runs, steps, n) of the same true
+        values in every run, which nobody knows
+    ensemble : number of members whose sample covariances these are, and whose mean the errors are about
     axes : (n,) names of the components of errors
     independent : each row is an independent run of one step. Errors may then be (N, n), with covariances (N, n, n) or
         deviations (N, n); of a path its rows are runs
@@ -186,9 +201,20 @@ def judge(
     stated = {key: value for key, value in given.items() if value is not None}
     if len(stated) > 1:
         raise InputError("covariances, deviations: give one of them beside errors")
-    if stated:
+    if "weights" in settings:
+        raise InputError(f"weights: {UNWEIGHTED}")
+    if members is not None:
+        if truth is None or isinstance(truth, str) or record is not None or stated:
+            raise InputError("members: need truth=, (runs, steps, n), beside them, and nothing else")
+        record = record_of_arrays({"members": members, "truth": truth}, axes, name, independent, ensemble)
+    elif truth is not None:
+        if not isinstance(truth, str) or truth != REPEATS or not stated:
+            raise InputError("truth: goes with members=; or is 'repeats', beside estimates with covariances")
+        given_estimates = {"estimates": cast(ArrayLike, record), **stated}
+        record = record_of_arrays(given_estimates, axes, name, independent, ensemble)
+    elif stated:
         stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
-        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent)
+        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent, ensemble)
         options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
         require_truth_options(options)
         (record,) = declared([record], options)

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 MOST_PANELS = 12  # components of an error that are drawn
+MOST_RANKS = 21  # that are drawn
+SPREADS = 10  # groups of steps by the spread of the members
 MOST_RUNS = 20  # runs that are drawn beside the shown one
 ANGLES = {"heading", "yaw", "pitch", "roll"}
 METRES = {"x", "y", "z"}
@@ -104,7 +106,7 @@ def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
     both = of_both(record)
     pictures = (
         _nees(both, verdict), _errors_over_sigma(both), _worst_run(both), _errors(both), _trajectory(both),
-        _coverage(both), _innovations(both, verdict),
+        _coverage(both), _ranks(record), _spread_and_skill(record), _innovations(both, verdict),
     )  # fmt: skip
     note = f" {OF_BOTH}" if record.truth.covariance is not None else ""
     return tuple(
@@ -441,6 +443,81 @@ def _shares(values: Array, limits: Array) -> Array:
     if not len(known):
         return np.full(len(limits), np.nan)
     return np.searchsorted(known, limits, side="right") / len(known)
+
+
+def rank_shares(record: Record) -> tuple[dict[str, Array], float]:
+    """Shares of truths in each rank among the members, by component, (k,), and by how much all lie near 1 / k.
+
+    The half-width of the band holds in all ranks with 95 %, by the spread between runs, which are independent.
+    """
+    if record.errors.ensemble is None or record.errors.error is None:
+        return {}, float("nan")
+    ranks = min(record.errors.ensemble.members + 1, MOST_RANKS)
+    names = list(record.errors.names or range(record.errors.error.shape[-1]))[: record.errors.ensemble.spread.shape[1]]
+    shares = {}
+    widths = []
+    for i, name in enumerate(names):
+        place = np.floor(special.ndtr(record.errors.error[..., i]) * ranks).clip(max=ranks - 1)
+        inside = place[..., None] == np.arange(ranks)
+        counts, size = inside.sum(axis=1), np.isfinite(place).sum()
+        shares[str(name)] = counts.sum(axis=0) / max(size, 1)
+        apart = counts - np.isfinite(place).sum(axis=1)[:, None] / ranks
+        widths.append(np.sqrt(np.square(apart).sum(axis=0).mean()) / max(size, 1))
+    return shares, float(-special.ndtri(0.025 / ranks) * np.mean(widths))
+
+
+def _ranks(record: Record) -> Picture | None:
+    """Histogram of the rank of the truth among the members."""
+    shares, width = rank_shares(record)
+    if not shares:
+        return None
+
+    def paint(axes: Axes) -> None:
+        ranks = len(next(iter(shares.values())))
+        axes.axhspan(1.0 / ranks - width, 1.0 / ranks + width, color=BAND, linewidth=0, zorder=0.5)
+        axes.axhline(1.0 / ranks, **stroke(EXPECTED), label="expected")
+        for number, (name, share) in enumerate(shares.items()):
+            axes.stairs(share, np.arange(ranks + 1) / ranks, **stroke(replace(style(number), width=1.1)), label=name)
+        axes.set(
+            xlabel="rank of the truth among the members", ylabel="share of steps", xlim=(0.0, 1.0), ylim=(0.0, None)
+        )
+
+    caption = (
+        "Share of the truths in each rank among the members: flat if both are exchangeable, high at both ends if "
+        "members spread too little, high in the middle if too much, a slope where they are biased. Shaded: where all "
+        "ranks of a component lie with 95 % if members are right, by the spread between runs."
+    )
+    return Picture("Ranks among the members", caption, (paint,), height=1.9)
+
+
+def _spread_and_skill(record: Record) -> Picture | None:
+    """Size of the errors about the mean of the members against the spread of these."""
+    if record.errors.ensemble is None:
+        return None
+    m, spread, square = record.errors.ensemble
+    expected = spread * (1.0 + 1.0 / m)  # of the squared error about the mean of m members
+
+    def paint(axes: Axes) -> None:
+        axes.plot([0.0, 1.0], [0.0, 1.0], transform=axes.transAxes, **stroke(EXPECTED), label="expected")
+        most = 1.0
+        for number, name in zip(
+            range(expected.shape[1]), record.errors.names or map(str, range(expected.shape[1])), strict=False
+        ):
+            rows = np.flatnonzero(np.isfinite(expected[:, number]) & np.isfinite(square[:, number]))
+            rows = rows[np.argsort(expected[rows, number])]
+            groups = [group for group in np.array_split(rows, SPREADS) if len(group)]
+            x, y = (np.sqrt([values[group, number].mean() for group in groups]) for values in (expected, square))
+            unit = float(np.sqrt(np.mean(np.square(x)))) or 1.0
+            curve(axes, x / unit, y / unit, replace(style(number), marker="o", width=1.1), name)
+            most = max(most, *(1.05 * np.concatenate([x, y]) / unit))
+        axes.set(xlabel="spread that is stated", ylabel="error of the mean", xlim=(0.0, most), ylim=(0.0, most))
+
+    caption = (
+        "Root mean square of the error of the mean of m members, in tenths of the steps by their spread, against that "
+        "spread times the root of 1 + 1/m, both over the mean spread. On the diagonal members spread as they err; the "
+        "spread of few members is partly chance, which makes the line flatter."
+    )
+    return Picture("Spread and skill", caption, (paint,), height=2.1)
 
 
 def _coverage(record: Record) -> Picture | None:

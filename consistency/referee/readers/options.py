@@ -14,6 +14,7 @@ from typing import Any
 from consistency.referee.errors import InputError
 
 COLUMNS = "columns"  # covariance of the truth: of its own file
+REPEATS = "repeats"  # in place of a file of the truth
 GROUPED = ("by", "by_file", "bins")  # options
 OF_AXES = ("world", "body_axes", "truth_world", "truth_body_axes")
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
@@ -54,6 +55,11 @@ def _columns(text: str) -> dict[str, str]:
     return columns
 
 
+def _columns_of_members(text: str) -> dict[str, str]:
+    """Names of components and of the columns of their members, of a text such as ``x=ex*,y=ey*``."""
+    return {name: column + "*" for name, column in _columns(text.replace("*", "")).items()}
+
+
 def _bins(text: str) -> int | list[float]:
     """A number of bins, or edges, of which a single one ends with a comma; NaN where one is none."""
     if text.strip().isdecimal():
@@ -72,7 +78,10 @@ def _option(
 class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 
-    truth: Path | None = _option("Truth of the estimates, in the same form, or the folder of a KITTI drive.")
+    truth: Path | None = _option(
+        "Truth of the estimates, in the same form, or the folder of a KITTI drive; or 'repeats': runs of the same true "
+        "values, without truth."
+    )
     covariance: Path | None = _option("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
     error: str | None = _option(
         "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
@@ -140,6 +149,16 @@ class Reading:
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
     dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
     unstated: bool | None = None  # of no command line: the covariance is I where the files state none
+
+    members: Mapping[str, str] | None = _option(
+        "Columns of the members of an ensemble: x=e* for all that begin with e.", "NAME=COLUMN*,…", _columns_of_members
+    )
+    ensemble: int | None = _option("Number of members whose mean and sample covariance the files state.", "N")
+
+    @property
+    def repeats(self) -> bool:
+        """Whether runs are repeats of the same true values, and no file is called so."""
+        return self.truth == Path(REPEATS) and not Path(REPEATS).exists()
 
     def given(self, names: Sequence[str] | None = None) -> list[str]:
         """Options among ``names``, or among all, that are given, in order."""

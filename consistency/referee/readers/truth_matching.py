@@ -153,7 +153,8 @@ def _bends(position: Array, after: Indices) -> Array:
     return np.asarray(np.maximum(second(after), second(after + 1)) / 8.0)
 
 
-OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend")
+OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend",
+                "members")  # fmt: skip
 OF_TRUTH = ("true_t", "truth", "true_clock", "true_covariance")
 
 
@@ -184,6 +185,7 @@ class Poses:
     true_clock: Array | None = None  # (M,), s
     nis: Array | None = None  # (N,)
     nis_dof: Array | None = None  # (N,)
+    members: Array | None = None  # (N, m, n), whose mean the estimate is; the error is then that of their ranks
     by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
     apart: Array | None = None  # (N,), s to the nearest sample of a truth that was matched
@@ -236,6 +238,12 @@ class Poses:
         estimate = self.estimate[rows]
         finite = finite_rows(estimate)
         out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
+        if self.members is not None:
+            from consistency.referee.diagnostics.statistics.normal_numbers import SEED, rank_numbers
+
+            rng = np.random.default_rng((SEED, self.run))
+            out[finite] = rank_numbers(self.members[rows][finite], truth[finite], rng)
+            return out
         error = planar_error
         if self.manifold == "spatial":
             from consistency.referee.geometry import state_error as error

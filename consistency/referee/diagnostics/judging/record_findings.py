@@ -41,7 +41,7 @@ from consistency.referee.diagnostics.questions.scale import (
     worst,
 )
 from consistency.referee.diagnostics.questions.tails import early_ends, lost_of
-from consistency.referee.diagnostics.records.record import Errors, InnovationRecord, Record
+from consistency.referee.diagnostics.records.record import Errors, InnovationRecord, RatioTable, Record
 from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
 from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
 from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
@@ -54,6 +54,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     Equivalence,
     ErrorParts,
     Innovations,
+    Interval,
     Lost,
     Scale,
     Settings,
@@ -110,6 +111,10 @@ def findings_of(
     unshown : why nothing can be shown, so that no question of the errors is asked and nothing is decided
     """
     runs, steps = runs_and_steps(record)
+    table = record.table()
+    asked_for = settings
+    if table is not None:
+        settings = _of_numbers(settings, table)
     both_sides = settings
     if record.fit.reduced:
         settings = replace(settings, allow="conservative")
@@ -171,6 +176,8 @@ def findings_of(
         share = truth.truth_share()
         status = truth.status(status, given_answers, settings)
         parts = _parts_of_estimate(truth, parts, given_answers, settings)
+    if table is not None:
+        parts = _of_covariance(parts, record, sample, asked_for)
     unshown, status, scale = withheld(unshown, status, parts.scale)
     is_early = inspection is not None and (inspection.spent is None or runs < FEWEST_PLANNED)
     later = status == "consistent" and is_early
@@ -181,7 +188,7 @@ def findings_of(
         status=status,
         runs=runs,
         steps=steps,
-        settings=settings,
+        settings=replace(settings, detect=asked_for.detect, tolerance=asked_for.tolerance),
         answers=given_answers,
         failures=record.failures,
         impossible=tuple(impossible),
@@ -292,6 +299,43 @@ def _equivalence(
     if inspection is None:
         return shown
     return worst((shown, equivalence_by_betting(sample.means(), sample.dof, settings, sample.early_means)))
+
+
+def _of_numbers(settings: Settings, table: RatioTable) -> Settings:
+    """Settings of numbers whose mean squares are not ratios of covariances."""
+    tolerance = None if settings.tolerance is None else table.factor(settings.tolerated)
+    return replace(settings, detect=table.factor(settings.factor), tolerance=tolerance)
+
+
+def _of_covariance(parts: ErrorParts, record: Record, sample: Sample | None, settings: Settings) -> ErrorParts:
+    """The parts of such numbers with ratios of the covariance, and what was asked of them."""
+    components = {} if sample is None else {**sample.components, **sample.reported}
+    tables = {key: record.table(index) for key, index in components.items()} | {MAIN: record.table()}
+
+    def of(mean_square: Interval, key: str) -> Interval:
+        table = tables[key]
+        assert table is not None
+        value, low, high = map(table.ratio, mean_square)
+        return Interval(min(value, float(table.true[-1])), low, high)
+
+    def shown(found: Equivalence) -> Equivalence:
+        interval = None
+        if found.interval is not None:
+            interval = of(Interval(1.0, *found.interval), MAIN)[1:]
+        return replace(found, factor=max(settings.factor, settings.tolerated), interval=interval)
+
+    found = parts.with_ratios(of)
+    if found.scale is not None:
+        found = found._replace(scale=replace(found.scale, equivalence=shown(found.scale.equivalence)))
+    if found.accuracy is not None:  # numbers have no units
+        none = float("nan")
+        rmse = np.full_like(found.accuracy.rmse, none)
+        accuracy = replace(found.accuracy, rmse=rmse, rmse_position=none, rmse_heading=none)
+        found = found._replace(accuracy=accuracy)
+    if found.by_group is not None:
+        groups = tuple(replace(group, equivalence=shown(group.equivalence)) for group in found.by_group.groups)
+        found = found._replace(by_group=replace(found.by_group, groups=groups))
+    return found
 
 
 def _early_ends(sample: Sample) -> EarlyEnds | None:
@@ -412,6 +456,7 @@ def _records_of_parts(record: Record) -> dict[str, Record]:
             covariance=covariance[..., some, :][..., some],
             dof=len(some),
             axes=tuple(axes[i] for i in index),
+            tables=tuple(record.errors.tables[i] for i in index if record.errors.tables),
             parts=(),
         )
         records[", ".join(names[i] for i in index)] = replace(record, errors=errors, innovations=InnovationRecord())
@@ -454,6 +499,9 @@ def _scale_of_whole(whole: Scale, parts: Mapping[str, Findings], record: Record,
     inflation = whole.inflation
     if counts.astype(bool).sum() < FEW:  # the errors of all parts may be the same
         inflation = ratio_interval(means[counts > 0], min(map(len, record.errors.parts)))
+        table = record.table()
+        if table is not None:
+            inflation = Interval(*map(table.ratio, inflation))
     return replace(
         whole,
         inflation=inflation,

@@ -272,31 +272,11 @@ class UncertainTruth:
 
     def of_estimate(self, parts: ErrorParts, answers: Sequence[Answer], settings: Settings) -> ErrorParts:
         """The parts with every ratio that of P."""
-        scale = parts.scale
-        location = parts.location
-        axes = parts.axes
-        bias = parts.bias
-        assert scale is not None
-        assert location is not None
-        assert axes is not None
-        assert bias is not None
-        detectable = self._of_P(Interval(*[scale.detectable] * 3), MAIN).value
-        scale = replace(scale, inflation=self._of_P(scale.inflation, MAIN), detectable=detectable)
-        if scale.within is not None:
-            scale = replace(scale, within=replace(scale.within, ratio=self._of_P(scale.within.ratio, MAIN)))
+        found = parts.with_ratios(self._of_P)
+        assert found.scale is not None
         if self.bounded:
-            scale = replace(scale, accepted=self._accepted(answers, settings))
-        inflation = {key: self._of_P(interval, key) for key, interval in axes.inflation.items()}
-        axes = replace(axes, inflation=inflation)
-        if axes.largest is not None:
-            axes = replace(axes, largest=self._of_P(axes.largest, MAIN))
-        if bias.inflation_without is not None:
-            bias = replace(bias, inflation_without=self._of_P(bias.inflation_without, MAIN))
-        if location.until is not None:
-            until = location.until
-            early = self._of_P(Interval(*[until.early] * 3), MAIN).value
-            location = replace(location, until=replace(until, early=early, late=self._of_P(until.late, MAIN)))
-        return parts._replace(scale=scale, location=location, axes=axes, bias=bias)
+            found = found._replace(scale=replace(found.scale, accepted=self._accepted(answers, settings)))
+        return found._replace(by_group=parts.by_group)
 
     def status(self, status: str, answers: Sequence[Answer], settings: Settings) -> str:
         """The status: where only bounds hold, by the side of what they found."""

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 INDEFINITE = "covariance is not positive definite"  # why a run failed
 FORMS = "a whole number of steps (20) or seconds (2s)"
 ROUNDING = 1e-6  # s: a double holds the seconds since 1970 to a quarter of that
+TINIEST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,38 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
+class Ensemble(NamedTuple):
+    """Members of all runs and steps, as they are drawn."""
+
+    members: int
+    spread: Array  # (k, n), variances of the members of k steps
+    square: Array  # (k, n), squares of truth less mean of the members
+
+
+class RatioTable(NamedTuple):
+    """What the mean square of a normal number is where the truth spreads more than stated, or less.
+
+    A rank among a few members, say, cannot show how far outside the truth lies.
+    """
+
+    true: Array  # (k,), ratios of true to stated covariance, increasing
+    shown: Array  # (k,), mean squares, which do not decrease: 1 at the ratio 1
+
+    def mean_square(self, ratio: float) -> float:
+        """Mean square of the numbers at a true ratio."""
+        return float(np.exp(np.interp(np.log(max(ratio, TINIEST)), np.log(self.true), np.log(self.shown))))
+
+    def factor(self, factor: float) -> float:
+        """The largest factor whose mean squares, up and down, are true ratios within ``factor``."""
+        return min(self.mean_square(factor), 1.0 / self.mean_square(1.0 / factor))
+
+    def ratio(self, mean_square: float) -> float:
+        """The true ratio behind a mean square: the smallest, or infinite, where none shows so little, or so much."""
+        if mean_square >= self.shown[-1]:
+            return float("inf")
+        return float(np.exp(np.interp(np.log(mean_square), np.log(self.shown), np.log(self.true))))
+
+
 @dataclass(frozen=True)
 class Errors:
     """Errors of the estimates and the covariances stated for them, or their NEES alone.
@@ -89,6 +122,8 @@ class Errors:
     parts: tuple[tuple[int, ...], ...] = ()
     assumed: bool = False  # no covariance is stated: it is I, to be corrected
     convention: str = ""  # of the error
+    tables: Sequence[RatioTable] = ()  # (n,), what mean squares of normal numbers say of the covariance; () of errors
+    ensemble: Ensemble | None = None  # what is drawn of it
 
     OF_RUNS: ClassVar = ("error", "covariance", "nees")
 
@@ -215,6 +250,14 @@ class Record:
             return self.runs.numbers
         there = (self.errors.error, self.errors.nees, self.innovations.nis, self.innovations.values)
         return np.arange(next((len(array) for array in there if array is not None), 0))
+
+    def table(self, index: Sequence[int] | None = None) -> RatioTable | None:
+        """What mean squares of some components together say of the covariance, or of all; None if they are its."""
+        some = [self.errors.tables[i] for i in range(len(self.errors.tables)) if index is None or i in index]
+        if not some:
+            return None
+        ratios = some[0].true
+        return RatioTable(ratios, np.mean([[one.mean_square(ratio) for ratio in ratios] for one in some], axis=0))
 
     @property
     def in_world(self) -> Record:

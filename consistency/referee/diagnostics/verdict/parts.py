@@ -5,7 +5,7 @@ The parts are frozen, and each field has its shape beside it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -406,6 +406,32 @@ class ErrorParts(NamedTuple):
     tails: Tails | None = None
     accuracy: Accuracy | None = None
     by_group: ByGroup | None = None
+
+    def with_ratios(self, of: Callable[[Interval, str], Interval]) -> ErrorParts:
+        """The parts with other ratios; ``of`` gives them of those here and the name of components, MAIN of all."""
+
+        def of_value(value: float) -> float:
+            return of(Interval(value, value, value), MAIN).value
+
+        scale, location, axes, bias, by_group = self.scale, self.location, self.axes, self.bias, self.by_group
+        if scale is not None:
+            within = scale.within and replace(scale.within, ratio=of(scale.within.ratio, MAIN))
+            inflation, detectable = of(scale.inflation, MAIN), of_value(scale.detectable)
+            scale = replace(scale, inflation=inflation, detectable=detectable, within=within)
+        if axes is not None:
+            largest = axes.largest and of(axes.largest, MAIN)
+            inflation_of = {key: of(interval, key) for key, interval in axes.inflation.items()}
+            axes = replace(axes, inflation=inflation_of, largest=largest)
+        if bias is not None and bias.inflation_without is not None:
+            bias = replace(bias, inflation_without=of(bias.inflation_without, MAIN))
+        if location is not None and location.until is not None:
+            until = location.until
+            until = replace(until, early=of_value(until.early), late=of(until.late, MAIN))
+            location = replace(location, until=until)
+        if by_group is not None:
+            groups = tuple(replace(group, ratio=of(group.ratio, MAIN)) for group in by_group.groups)
+            by_group = replace(by_group, groups=groups)
+        return self._replace(scale=scale, location=location, axes=axes, bias=bias, by_group=by_group)
 
 
 def _log(ratio: float) -> float:

@@ -35,6 +35,7 @@ from consistency.referee.readers.truth_matching import Estimator, Poses, at, man
 from consistency.referee.types import Array, Failure, Indices
 
 OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
+OF_MEMBERS, OF_REPEATS = ("members", "truth"), ("estimates", "covariances")
 PLANAR_POSE = ("x", "y", "heading")
 OF_STATES = {"R", "p", "v"}  # of an inertial filter
 BY_STEP = TruthFit(  # n NEES / dof of a step with n, the smallest dof, has the mean n and less spread than n
@@ -46,9 +47,13 @@ FEWEST = 10  # runs and steps from which on swapped arrays are looked for
 ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
 ALIKE = 0.5  # correlation from run to run
 UNLIKE = 0.2  # of it, from step to step
-KINDS = "errors and covariances; or estimates, truth and covariances; or nees and dof"
+KINDS = "errors and covariances; or estimates, truth and covariances; or members and truth; or nees and dof"
 
 
+UNWEIGHTED = (
+    "ranks among weighted members are not uniform (3 % of those of a right filter lie beyond its 1 %); draw members of "
+    "equal weight from all particles, far fewer than are effective, and give these"
+)
 HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
 AXES = {
     "R": ("roll", "pitch", "yaw"),
@@ -65,7 +70,8 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     """The estimator of an archive; its record where it holds NEES.
 
     ``errors`` (runs, steps, n) with ``covariances`` (runs, steps, n, n); or ``estimates`` and ``truth``, both
-    (runs, steps, n), with ``covariances``; or ``nees`` (runs, steps) with ``dof``. One run may lack the first
+    (runs, steps, n), with ``covariances``; or ``members`` (runs, steps, m, n) with ``truth``; or ``nees`` (runs, steps)
+    with ``dof``. With ``--truth repeats`` there is no ``truth``. One run may lack the first
     dimension. Optional: ``nis`` and ``nis_dof`` (runs, steps), ``axes`` (n,), ``t`` (steps,), and ``lengths``
     (runs,), the number of steps of each run, where they differ, and ``mask`` (runs, steps), true where there is no
     truth, so that the step does not count. With ``--relative`` estimates and truth are planar
@@ -108,6 +114,12 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         assert found.errors.nees is not None
         return replace(found, runs=replace(found.runs, by=archive.groups(r, found.errors.nees.shape)))
     declared = ""
+    if kind == OF_MEMBERS:
+        return _of_members(archive, r)
+    if kind == OF_REPEATS:
+        own = archive.array("estimates", 3)
+        first = np.take_along_axis(own, np.argmax(np.isfinite(own), axis=0)[None], axis=0)  # any value would do
+        archive = Archive(path, {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, own.shape))})
     if kind != OF_NEES:
         require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
     if kind == OF_ERRORS:
@@ -121,7 +133,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     by = archive.groups(r, (runs, steps))
     covariances = archive.matrices("covariances", shape)
     there = archive.known(runs, steps)
-    if kind == OF_POSES:
+    if kind in (OF_POSES, OF_REPEATS):
         truth = _finite_truth(path, estimates, truth, there)
     nis, dof = archive.nis((runs, steps))
     of_truth = cross = None
@@ -170,17 +182,46 @@ def _kind(archive: Archive, r: Reading) -> tuple[str, ...]:
     """
     path = archive.path
     keys = set(archive.arrays)
-    kind = next((needed for needed in (OF_ERRORS, OF_POSES, OF_NEES) if set(needed) <= keys), None)
+    kinds = (OF_ERRORS, OF_REPEATS if r.repeats else OF_POSES, OF_MEMBERS, OF_NEES)
+    kind = next((needed for needed in kinds if set(needed) <= keys), None)
+    if "weights" in keys:
+        raise InputError(f"{path}: key 'weights': {UNWEIGHTED}")
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(keys)) or 'nothing'}")
     unknown = sorted(keys - set(kind) - OPTIONAL)
     if unknown and r.by is None:
         raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
-    if r.error is not None and kind != OF_POSES:
+    if r.error is not None and kind not in (OF_POSES, OF_REPEATS):
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
     if r.relative is not None and kind != OF_POSES:
         raise InputError(f"{path}: --relative needs the keys {', '.join(OF_POSES)}, of poses or motions")
     return kind
+
+
+def _of_members(archive: Archive, r: Reading) -> Estimator:
+    """The estimator of members of ensembles, (runs, steps, m, n), whose errors are ranks of the truth among them."""
+    from consistency.referee.readers.formats.members import checked_members, of_members
+
+    path = archive.path
+    members = archive.array("members", 4, "m")
+    truth = archive.array("truth", 3)
+    runs, steps, m, n = members.shape
+    if truth.shape != (runs, steps, n):
+        beside = f"needs {(runs, steps, n)} beside 'members' {members.shape}, (runs, steps, m, n)"
+        raise InputError(f"{path}: key 'truth' has shape {truth.shape}, {beside}")
+    there = archive.known(runs, steps)
+    flat = checked_members(
+        members.reshape(-1, m, n),
+        there.ravel(),
+        lambda k: f"{path}: key 'members', run {k // steps}, step {k % steps + 1}",
+    )
+    means = flat.mean(axis=1).reshape(truth.shape)
+    by = archive.groups(r, (runs, steps))
+    poses = []
+    for one in _runs(archive, means, _finite_truth(path, means, truth, there), there):
+        rows = one.run, slice(len(one.t))
+        poses.append(replace(one, manifold="vector", convention="vector", by=at(by, rows), members=members[rows]))
+    return of_members(Estimator(path.stem, path, poses, archive.axes(n), t=archive.times(steps)), r)
 
 
 def _convention(archive: Archive, r: Reading, n: int) -> str:
@@ -326,6 +367,8 @@ def _member(path: Path, archive: Any, key: str) -> Array:
         if "allow_pickle" not in str(error):
             raise
         what = "holds Python objects, as of runs of different lengths; pad them with NaN and add 'lengths'"
+        if key == "members":
+            what += "; all steps need equally many members"
         raise InputError(f"{path}: key '{key}' {what}") from None
     return array
 
@@ -350,13 +393,13 @@ class Archive:
             raise InputError(f"{self.path}: key '{key}' holds {array.dtype}, not numbers")
         return array
 
-    def array(self, key: str, dimensions: int) -> Array:
+    def array(self, key: str, dimensions: int, third: str = "n") -> Array:
         """An array of floats; one run without its dimension gets it."""
         array = self.require_numbers(key)
         if array.ndim == dimensions - 1:
             array = array[None]
         if array.ndim != dimensions or not array.size:
-            needed = ", ".join(("runs", "steps", "n", "n")[:dimensions])
+            needed = ", ".join(("runs", "steps", third, "n")[:dimensions])
             raise InputError(f"{self.path}: key '{key}' has shape {array.shape}, needs ({needed})")
         return bounded(np.asarray(array, float))
 

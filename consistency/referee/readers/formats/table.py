@@ -46,11 +46,11 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
     """
     if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
         raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    axes = tuple(r.state or _own_state(estimates, r) or POSE)
+    axes = tuple(r.members or r.state or _own_state(estimates, r) or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
     if r.state is None and axes != tuple(POSE):
         notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its covariance P_* says; --state names another")
-    convention = _convention(r.error, axes, truth)
+    convention = _convention(r.error, axes, truth) if r.members is None else "vector"
     _require_truth(sheet, truth, axes, convention, r)
     key = _key(sheet, truth, r)
     of_filters = {sheet.path.stem: sheet}
@@ -75,7 +75,15 @@ def _both(
     sheet, read_as = _sheet(estimates, axes, r.columns, bool(r.motions))
     notes = [sheet.cut, read_as]
     truth = None
-    if r.truth is not None:
+    if r.members is not None:
+        from consistency.referee.readers.formats.members import with_means
+
+        sheet = with_means(sheet, r.members)
+    if r.repeats:
+        from consistency.referee.readers.formats.members import beside_first_run
+
+        sheet, truth = beside_first_run(sheet, axes)
+    elif r.truth is not None:
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
@@ -255,7 +263,8 @@ def _estimator(
     notes = _absent(name, truth, runs, true_runs)
     stated = WHOLE
     cross = of_truth = None
-    if not poses_alone and (not r.unstated or covariance_columns(list(sheet.data), axes).places):
+    is_stated = not r.unstated or covariance_columns(list(sheet.data), axes).places
+    if not poses_alone and r.members is None and is_stated:
         covariance, stated, note = _covariance(name, sheet, axes, convention)
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])
@@ -292,6 +301,10 @@ def _estimator(
         nis_dof=dof,
         by=columns.own_column(sheet, r),
     )
+    if r.members is not None:
+        from consistency.referee.readers.formats.members import member_columns
+
+        poses = replace(poses, members=member_columns(sheet, r.members))
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
         of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
@@ -300,9 +313,14 @@ def _estimator(
             has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
     definition = PLANAR[convention]
-    return Estimator(
+    found = Estimator(
         name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, position=_position(axes)
     )
+    if r.members is None:
+        return found
+    from consistency.referee.readers.formats.members import of_members
+
+    return of_members(found, r)
 
 
 def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:

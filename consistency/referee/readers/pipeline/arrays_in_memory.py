@@ -24,13 +24,18 @@ from consistency.referee.types import Array, Indices
 
 
 def record_of_arrays(
-    given: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool = False
+    given: Mapping[str, ArrayLike],
+    axes: Sequence[str] | None,
+    name: str,
+    independent: bool = False,
+    ensemble: int | None = None,
 ) -> Record:
     """Arrays in memory as a record, like those of an archive; see :func:`consistency.judge`.
 
     Parameters
     ----------
-    given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of any
+    given : errors or estimates with covariances or deviations, or members with truth, or nees with dof; estimates are
+        repeats of the same true values. Steps that are masked in a masked array of any
         of them have no truth and do not count
 
     Raises
@@ -40,17 +45,21 @@ def record_of_arrays(
         finite in any run.
     """
     first = next(iter(given))
+    reading = Reading(ensemble=ensemble)
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
-        if arrays["errors"].ndim == 3:  # of runs whose steps are independent, too
+        if arrays[first].ndim == 3 and first == "errors":  # of runs whose steps are independent, too
             arrays = {key: array.reshape(-1, *array.shape[2:]) for key, array in arrays.items()}
-        _require_rows({key: array.shape for key, array in arrays.items()})
+        if first != "members":  # whose shapes are compared below
+            _require_rows(first, {key: array.shape for key, array in arrays.items()})
         arrays = {key: array[:, None] for key, array in arrays.items()}
-    if first == "errors" and "covariances" in arrays:
+    if first in ("errors", "estimates") and "covariances" in arrays:
         require_layout(first, arrays[first].shape, arrays["covariances"].shape)
     shape = arrays[first].shape
     wanted = ["runs", "steps"]
-    if first == "errors":
+    if first == "members":
+        wanted.append("m")
+    if first != "nees":
         wanted.append("n")
     if len(shape) != len(wanted) or 0 in shape:
         text = f"{first} has shape {shape}, needs ({', '.join(wanted)})"
@@ -63,10 +72,14 @@ def record_of_arrays(
                 "cs.judge, says that each row is a run of its own, which the steps of a log are not"
             )
         raise InputError(text)
+    if first == "estimates":
+        own = arrays.pop(first)
+        begin = np.take_along_axis(own, np.argmax(np.isfinite(own), axis=0)[None], axis=0)
+        arrays = {"errors": begin - own, **arrays}  # from any one value: what all share is lost
     sigma = arrays.pop("deviations", None)
     if sigma is not None:
         if sigma.shape != shape:
-            raise InputError(f"deviations has shape {sigma.shape}, needs that of errors, {shape}")
+            raise InputError(f"deviations has shape {sigma.shape}, needs that of {first}, {shape}")
         arrays["covariances"] = diagonal(sigma)
     mask = np.zeros(shape[:2], bool)
     for key, value in given.items():
@@ -86,9 +99,14 @@ def record_of_arrays(
     if axes is not None:
         arrays["axes"] = np.asarray(axes, str)
     try:
-        record = estimator_of_arrays(Path("arrays"), arrays, Reading())
+        record = estimator_of_arrays(Path("arrays"), arrays, reading)
         if isinstance(record, Estimator):
-            (record,) = records_of(record, Reading())
+            (record,) = records_of(record, reading)
+        if ensemble is not None or first == "estimates":
+            from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
+
+            record = of_repeats(record) if first == "estimates" else record
+            record = record if ensemble is None else of_ensemble(record, ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
     if sigma is not None:
@@ -109,16 +127,16 @@ def _in_python(message: str, deviations: bool) -> str:
     return re.sub(r"\bcovariances?\b", "deviations", text) if deviations else text
 
 
-def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse errors and what is stated of them, each row a run, if their shapes do not fit."""
-    shape = shapes["errors"]
+def _require_rows(first: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse errors or estimates and what is stated of them, each row a run, if their shapes do not fit."""
+    shape = shapes[first]
     if len(shape) != 2 or 0 in shape:
-        text = f"errors has shape {shape}, needs (N, n) with independent=True"
+        text = f"{first} has shape {shape}, needs (N, n) with independent=True"
         if len(shape) == 1:
             stated = "covariances[:, None, None] of its variances"
             if "deviations" in shapes:
                 stated = "deviations[:, None]"
-            text += f"; one component is errors[:, None] and {stated}"
+            text += f"; one component is {first}[:, None] and {stated}"
         raise InputError(text)
     for key, own in shapes.items():
         needs = (*shape, shape[1]) if key.endswith("covariances") else shape
@@ -129,7 +147,7 @@ def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
             remedy = f"; one for all rows is np.broadcast_to({key}, {needs})"
         elif own == shape:
             remedy = f"; variances are {key}[:, :, None] * np.eye({shape[1]}), standard deviations go into deviations="
-        raise InputError(f"{key} has shape {own}, needs {needs} beside errors of shape {shape}{remedy}")
+        raise InputError(f"{key} has shape {own}, needs {needs} beside {first} of shape {shape}{remedy}")
 
 
 def masked_steps(key: str, value: ArrayLike, shape: tuple[int, ...]) -> Indices:

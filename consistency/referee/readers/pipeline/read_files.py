@@ -31,7 +31,7 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
-from consistency.referee.readers.options import OF_AXES, Reading, flag_of
+from consistency.referee.readers.options import GROUPED, OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
@@ -47,10 +47,16 @@ NO_GUESS = {
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 OF_BAGS = ("topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
+OF_TABLES = ("dof", "members")
 OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
-ARCHIVE_KEYS = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}  # in place of options
+ARCHIVE_KEYS = {
+    "truth": "truth",
+    "members": "members",
+    "axes": "axes",
+    "truth_covariance": "truth_covariances",
+}  # in place of options
 PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
 Found = Sequence[Estimator | Record]
 
@@ -131,11 +137,13 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
-    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES), _bags),
+    Kind(
+        _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive
+    ),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
+    Kind(_is_trajectory, (*OF_BAGS, "state", *OF_TABLES), _trajectories),
 )
 
 
@@ -156,7 +164,12 @@ def found_in(estimates: Path, r: Reading) -> Found:
     if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
         raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
     kind = kind_of(estimates, r)
-    refuse_options(estimates, r, *(OF_BAGS if kind is None else kind.refused))
+    of_truth = r
+    if r.repeats:
+        of_truth = replace(r, truth=None)
+        if kind is not None and kind.read not in (_archive, _tables):
+            raise InputError(f"--truth repeats: is for tables and archives of runs of the same values, not {estimates}")
+    refuse_options(estimates, of_truth, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
         raise unknown_kind(estimates)
     if r.truth is not None and is_foreign(r.truth):
@@ -283,6 +296,13 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
         from consistency.referee.readers.truth_covariance import declared
 
         records = declared(records, r)
+    if r.repeats or r.ensemble is not None:
+        from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
+
+        if r.repeats:
+            records = [of_repeats(record) for record in records]
+        if r.ensemble is not None:
+            records = [of_ensemble(record, r.ensemble) for record in records]
     if r.independent and r.relative is None:
         from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
 
@@ -393,6 +413,13 @@ def checked_options(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    if r.repeats:
+        why = ": repeats have no truth, and each run is compared with those before"
+        r.refuse(
+            "--truth repeats", dict.fromkeys((*OF_WINDOWS, *OF_TRUTH, *GROUPED, "align", "split", "time_offset"), why)
+        )
+    if r.ensemble is not None and r.given(OF_TRUTH):
+        raise InputError(f"--ensemble: does not go with {flag_of(r.given(OF_TRUTH)[0])}, of a Gaussian error")
     for name in ("by_file", "bins"):
         if r.given([name]) and r.by is None:
             raise InputError(f"{flag_of(name)}: goes with --by COLUMN")

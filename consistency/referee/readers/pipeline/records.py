@@ -26,6 +26,7 @@ from consistency.referee.readers.runs_to_record import (
     level_components,
 )
 from consistency.referee.readers.truth_matching import (
+    ALONE,
     AXES,
     ROUNDING,
     WHOLE,
@@ -63,6 +64,8 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         e = with_unit_covariances(e)
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
+    if r.ensemble is not None:
+        e = _without_cross_terms(e, judged, r.ensemble)
     if r.by is None:
         records, _ = _records(e, judged, r)
         return records
@@ -159,7 +162,9 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         if r.axes is None:
             judged, still = estimated_components(e, errors, judged)
             notes += [*level, *still]
-    causes = [*_causes(e, runs, shift, judged), *e.causes]
+    causes = [*e.causes]
+    if r.ensemble is None and runs[0].members is None and not r.repeats:
+        causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
     if e.convention:
         notes.append(f"error convention {e.convention}: {e.definition}")
@@ -185,10 +190,26 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         )
         if e.stated.alone:
             record = each_alone(record)
+        if runs[0].members is not None:
+            from consistency.referee.diagnostics.statistics.normal_numbers import of_ranks
+
+            members = np.concatenate([p.members for p in pairs if p.members is not None])
+            record = of_ranks(record, part, members, np.concatenate([p.truth for p in pairs]))
         records.append(record)
         notes = []
         causes = []
     return records, pairs
+
+
+def _without_cross_terms(e: Estimator, judged: Sequence[int], N: int) -> Estimator:
+    """The estimator with variances alone where the covariance of N members has no full rank."""
+    if N < 2:
+        raise InputError(f"--ensemble {N}: must be the number of members, 2 or more")
+    if len(judged) < N or e.stated.alone:
+        return e
+    runs = [replace(p, covariance=np.where(np.eye(p.covariance.shape[-1]), p.covariance, 0.0)) for p in e.runs]
+    note = f"{e.said}: the covariance of {N} members has rank {N - 1}, so each component is judged by itself"
+    return replace(e, runs=runs, stated=ALONE, notes=(*e.notes, note))
 
 
 # --- estimates and truth ---------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
-from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
+from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
@@ -50,6 +50,9 @@ def read(
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
+    level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
+    ends: str | None = None,
     by: str | None = None,
     by_file: str | Path | None = None,
     bins: int | Sequence[float] | None = None,
@@ -90,6 +93,10 @@ def read(
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
         None only what holds under any dependence is said
     truth_shared : the estimator has fused the truth
+    level : of bounds, radii and intervals in columns ``bound_x``, ``radius_x_y``, ``x_low`` and ``x_high``, or the key
+        ``bounds``: 0.95, "95%", "2sigma", "CEP"; or by name, ``{"bound_x": 0.95}``
+    gaussian : read them, or deviations at that level, as the covariance of a Gaussian, circular for radii
+    ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
     by : column whose values make groups, in each of which the size of the errors is judged, too: words as they are,
         numbers in quantile bins. It was fixed before the error was: a setting, the environment, time, what had been
         measured so far
@@ -115,6 +122,7 @@ def read(
         time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
         motions=motions or None, windows=windows, align=align, lever_arm=lever_arm, split=split,
         truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
+        level=level, gaussian=gaussian or None, ends=ends,
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
         world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
@@ -135,6 +143,10 @@ def judge(
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
+    bounds: ArrayLike | None = None,
+    level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
+    ends: str | None = None,
     axes: Sequence[str] | None = None,
     independent: bool = False,
     name: str = "estimator",
@@ -159,6 +171,14 @@ def judge(
     covariances : (runs, steps, n, n), beside errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share (Holm)
+    bounds : (runs, steps, n), in place of covariances, bounds on the size of each component; or (runs, steps), on the
+        length of all, such as a horizontal radius. The question is then whether errors leave them as often as their
+        level says
+    level : share of the steps in which the error stays inside a bound: 0.95, "95%", "2sigma", "CEP", or by name,
+        ``{"bound_x": 0.95}``
+    gaussian : bounds, or deviations and covariances at that level, stand for the covariance of a Gaussian, which is
+        judged
+    ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
     axes : (n,) names of the components of errors
     independent : errors are (N, n) and covariances (N, n, n), or deviations (N, n), and each row is an independent run
         of one step
@@ -179,18 +199,22 @@ def judge(
         A setting out of its range, or nothing is left; shapes that do not fit, a covariance that is not symmetric, a
         step that is not finite in any run.
     """
-    given = {"covariances": covariances, "deviations": deviations}
+    given = {"covariances": covariances, "deviations": deviations, "bounds": bounds}
     stated = {key: value for key, value in given.items() if value is not None}
     if len(stated) > 1:
-        raise InputError("covariances, deviations: give one of them beside errors")
+        raise InputError(f"{', '.join(stated)}: give one of them beside errors")
+    of_bounds = Reading(level=level, gaussian=gaussian or None, ends=ends)
+    if bounds is not None or of_bounds.given():
+        of_bounds = checked_options(of_bounds)
     if stated:
         stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
-        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent)
+        errors = {"errors": cast(ArrayLike, record)}
+        record = record_of_arrays({**errors, **stated}, axes, name, independent, of_bounds)
         options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
         require_truth_options(options)
         (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
-        record = read(record)
+        record = read(record, level=level, gaussian=gaussian, ends=ends)
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
     if by is not None or bins is not None:

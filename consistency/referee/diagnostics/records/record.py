@@ -70,6 +70,15 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
+class Bound(NamedTuple):
+    """A bound on the size of one component of the error, or on the length of several."""
+
+    name: str  # of its column: bound_x, radius_x_y
+    components: tuple[str, ...]
+    level: float  # share of the steps in which the error is inside
+    ends_independent: bool = False  # declared: where runs end, and which are lost, does not depend on the errors
+
+
 @dataclass(frozen=True, repr=False)
 class Record:
     """The runs of one estimator: errors with covariances, or NEES, or innovations, or several of them.
@@ -128,6 +137,8 @@ class Record:
     truth_covariance: Array | None = None  # (runs, steps, n, n), of the truth itself; NaN where it has none
     truth_errors: str | None = None  # declared: its errors are "independent", "per-run" or "common" to all runs
     truth_shared: bool = False  # declared: the estimator has fused the truth
+    bounds: tuple[Bound, ...] = ()  # that are judged in place of covariances
+    bound_ratios: Array | None = None  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
     # beside the errors
@@ -148,7 +159,7 @@ class Record:
         """Labels of the runs, (runs,)."""
         if self.runs is not None:
             return self.runs
-        there = (self.error, self.nees, self.nis, self.innovations)
+        there = (self.error, self.nees, self.nis, self.innovations, self.bound_ratios)
         return np.arange(next((len(array) for array in there if array is not None), 0))
 
     @property
@@ -194,7 +205,10 @@ class Record:
         if skip is None:
             return self
 
-        arrays = {name: getattr(self, name) for name in ("covariance", "nees", "nis", "nis_dof", "innovations")}
+        arrays = {
+            name: getattr(self, name)
+            for name in ("covariance", "nees", "nis", "nis_dof", "innovations", "bound_ratios")
+        }
         world = self.world
         t = self.times
         if world is not None:
@@ -283,7 +297,7 @@ def shown_by(function: str, *arguments: Any) -> Any:
 def arrays_of(record: Record) -> dict[str, Any]:
     """Arrays over runs and steps that a record has, by name."""
     names = ("error", "covariance", "nees", "nis", "nis_dof", "innovations", "innovation_covariances", "times",
-             "truth_covariance", "path", "by")  # fmt: skip
+             "truth_covariance", "path", "by", "bound_ratios")  # fmt: skip
     return {name: array for name in names if (array := getattr(record, name)) is not None}
 
 

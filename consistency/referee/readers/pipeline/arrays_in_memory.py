@@ -24,7 +24,11 @@ from consistency.referee.types import Array, Indices
 
 
 def record_of_arrays(
-    given: Mapping[str, ArrayLike], axes: Sequence[str] | None, name: str, independent: bool = False
+    given: Mapping[str, ArrayLike],
+    axes: Sequence[str] | None,
+    name: str,
+    independent: bool = False,
+    options: Reading | None = None,
 ) -> Record:
     """Arrays in memory as a record, like those of an archive; see :func:`consistency.judge`.
 
@@ -32,6 +36,7 @@ def record_of_arrays(
     ----------
     given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of any
         of them have no truth and do not count
+    options : level of bounds, and what is declared of them
 
     Raises
     ------
@@ -84,12 +89,12 @@ def record_of_arrays(
     if axes is not None:
         arrays["axes"] = np.asarray(axes, str)
     try:
-        record = estimator_of_arrays(Path("arrays"), arrays, Reading())
+        record = estimator_of_arrays(Path("arrays"), arrays, options or Reading())
         if isinstance(record, Estimator):
-            (record,) = records_of(record, Reading())
+            (record,) = records_of(record, options or Reading())
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
-    if sigma is not None:
+    if sigma is not None and not record.bounds:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
@@ -114,7 +119,7 @@ def _require_rows(shapes: Mapping[str, tuple[int, ...]]) -> None:
         raise InputError(text)
     for key, own in shapes.items():
         needs = (*shape, shape[1]) if key.endswith("covariances") else shape
-        if own == needs:
+        if own == needs or (key == "bounds" and own == shape[:1]):
             continue
         remedy = ""
         if own == needs[1:]:

@@ -48,6 +48,7 @@ OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # opt
 OF_BAGS = ("topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
 OF_NAMES = ("columns", "truth_columns")
+OF_BOUNDS = ("level", "gaussian", "ends")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 ARCHIVE_KEYS = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}  # in place of options
@@ -120,7 +121,8 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    if path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns)):
+    named = r.state is not None or r.level is not None
+    if path.suffix.lower() in TABLES and (named or not is_spatial(path, r.columns)):
         return True
     return is_plane(path, r.columns)
 
@@ -131,11 +133,11 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_BOUNDS, "dof"), _bags),
     Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
+    Kind(_is_trajectory, (*OF_BAGS, *OF_BOUNDS, "state", "dof"), _trajectories),
 )
 
 
@@ -385,6 +387,10 @@ def checked_options(r: Reading) -> Reading:
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
+    if r.given(OF_BOUNDS):
+        from consistency.referee.readers.formats.bounds import require_bound_options
+
+        require_bound_options(r)
     for name in ("by_file", "bins"):
         if r.given([name]) and r.by is None:
             raise InputError(f"{flag_of(name)}: goes with --by COLUMN")

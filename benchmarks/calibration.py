@@ -57,6 +57,7 @@ MODULES = (
     "calibration_lengths",
     "calibration_spread",
     "calibration_groups",
+    "calibration_bounds",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
 ANY = WORLDS | LOGS | HEAVY
 

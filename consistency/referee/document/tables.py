@@ -453,6 +453,27 @@ def _percent_text(share: Interval) -> str:
     return f"{value if value != 'nan' else '-'} [{low}, {high}] %"
 
 
+def bound_plan_lines(planned: dict[str, Any]) -> list[str]:
+    """Runs that bounds of a level take, a line for each thing to be shown."""
+    from consistency.referee.diagnostics.words.bounds import level_text
+
+    p = planned
+    level, factor, power = level_text(p["level"]), f"{p['detect']:.3g}", p["power"]
+    near = f"between {short(p['detect'] ** -0.5)} and {short(p['detect'] ** 0.5)}"
+
+    def runs(key: str) -> str:
+        return "more than a million" if p[key] is None else str(p[key])
+
+    return [
+        f"{runs('consistent')} runs show that the factor of a right bound of {level} is {near}, with power {power:g}, "
+        "however steps depend on each other",
+        f"{runs('small')} runs find a bound too small by x{factor} at false alarm {p['false_alarm']:g} with that power",
+        f"{runs('large')} runs find a bound too large by x{factor}",
+        f"with fewer than {p['fewest']} runs no bound of {level} is shown to hold or to be too large, as all may stay "
+        "inside",
+    ]
+
+
 def plan_lines(planned: dict[str, Any]) -> list[str]:
     """Runs that a verdict takes, a line for each thing to be shown.
 

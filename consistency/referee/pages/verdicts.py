@@ -161,11 +161,11 @@ def method(studies: Sequence[Judged]) -> str:
         ),
         (
             any(study.of_bounds for study in studies),
-            " Bounds are judged by the share of the steps of each run in which the error is outside. A fault is found by "
-            "Gaffke's test (2005), whose rate is measured, and up to a false-alarm rate of .001 by a bet against the "
-            "bound (Waudby-Smith & Ramdas 2024), whose rate is proved. Steps after the end of a run count as inside for "
-            "'too small' and as outside for 'too large'. The factor is that by which the bound must grow, with its 95 % "
-            "interval by inversion of the test.",
+            " Bounds are judged by the share of the steps of each run in which the error is outside. A fault is found "
+            "by Gaffke's test (2005), whose rate is measured, and up to a false-alarm rate of .001 by a bet against "
+            "the bound (Waudby-Smith & Ramdas 2024), whose rate is proved. Steps after the end of a run count as "
+            "inside for 'too small' and as outside for 'too large'. The factor is that by which the bound must grow, "
+            "with its 95 % interval by inversion of the test.",
         ),
         (
             any(not study.has_truth for study in studies),

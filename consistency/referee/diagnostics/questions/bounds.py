@@ -18,10 +18,10 @@ from consistency.referee.diagnostics.records.record import Bound, Record
 from consistency.referee.diagnostics.statistics.exceedance import (
     Exceedance,
     betting,
-    bound_runs,
     fewest_runs,
     gaffke,
     missing_steps,
+    runs_to_show,
 )
 from consistency.referee.diagnostics.verdict.parts import (
     Answer,
@@ -160,7 +160,7 @@ def _with_runs(score: BoundScore, settings: Settings) -> BoundScore:
     """A score with the number of runs that show a right bound to be right, however steps depend on each other."""
     if score.status != "undecided":
         return score
-    runs = bound_runs(score.level, settings.detect, settings.false_alarm, settings.power).consistent
+    runs = runs_to_show(score.level, settings.detect, settings.power)
     return replace(score, equivalence=replace(score.equivalence, runs=runs))
 
 

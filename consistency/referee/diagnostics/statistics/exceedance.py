@@ -25,6 +25,7 @@ HALVINGS = 60  # of an interval: more than a double resolves
 NEAR = 1e-3  # saddle points nearer to 0 than this take the limit there
 TAIL = (1.0 - CONFIDENCE) / 2.0  # of each side of an interval
 LARGEST = 10**6  # runs; more are not planned
+TRIED, TEETH = 600, 8  # numbers of runs up to that, and how many of their gaps are looked through
 Test = Callable[[Array, float], Array]
 
 
@@ -151,7 +152,7 @@ class Exceedance:
         """Rate of steps outside that the runs exclude, with all larger ones: 3 / N where N runs never leave."""
         shares = 1.0 - self.shares()[1]
         low, high = 0.0, 1.0
-        for _ in range(HALVINGS):
+        for _ in range(HALVINGS // 2):
             rate = 0.5 * (low + high)
             if rate < 1.0 and gaffke(shares, 1.0 - rate) <= 1.0 - confidence:
                 high = rate
@@ -213,30 +214,23 @@ def bound_runs(
     detect : ratio of covariances; *consistent* is a factor of the bound within its root
     find : factor by which a bound is too small or too large that is to be found; ``detect`` if not given
     """
-    alike = max(detect, 1.0 / detect) ** 0.5
-    wrong = max(detect, 1.0 / detect) if find is None else find
-    fewest = fewest_runs(level, 1.0 - power)
-    most = min(LARGEST, 2 * fewest + 1000)
-    while True:
-        found = _bound_runs(level, alike, wrong, false_alarm / 2.0, power, most)
-        if None not in found or most == LARGEST:
-            return BoundRuns(fewest, *found)
-        most = min(LARGEST, 4 * most)
-
-
-def _bound_runs(
-    level: float, alike: float, wrong: float, side: float, power: float, most: int
-) -> tuple[int | None, int | None, int | None]:
-    """Runs that show a right bound, find one that is too small, and one that is too large; None above ``most``."""
     a = 1.0 - level
-    n = np.arange(1, most + 1)
-    tail = 1.0 - power
-    shown = _found_large(n, a, _rate(level, alike), tail) + _found_small(n, a, _rate(level, 1.0 / alike), tail) - 1.0
-    return (
-        _least(shown >= power),
-        _least(_found_small(n, a, _rate(level, 1.0 / wrong), side) >= power),
-        _least(_found_large(n, a, _rate(level, wrong), side) >= power),
+    wrong = max(detect, 1.0 / detect) if find is None else find
+    side = false_alarm / 2.0
+    return BoundRuns(
+        fewest_runs(level, 1.0 - power),
+        runs_to_show(level, detect, power),
+        _least(lambda n: _found_small(n, a, _rate(level, 1.0 / wrong), side) >= power),
+        _least(lambda n: _found_large(n, a, _rate(level, wrong), side) >= power),
     )
+
+
+def runs_to_show(level: float, detect: float = DETECT, power: float = POWER) -> int | None:
+    """Runs that show a right bound to be right, as ``consistent`` of :func:`bound_runs`."""
+    a, tail = 1.0 - level, 1.0 - power
+    alike = max(detect, 1.0 / detect) ** 0.5
+    below, above = _rate(level, alike), _rate(level, 1.0 / alike)
+    return _least(lambda n: _found_large(n, a, below, tail) + _found_small(n, a, above, tail) - 1.0 >= power)
 
 
 def _rate(level: float, factor: float) -> float:
@@ -260,14 +254,20 @@ def _found_small(n: Indices, a: float, rate: float, tail: float) -> Array:
     return np.where(k <= n, special.bdtrc(np.minimum(np.maximum(k - 1.0, 0.0), n), n, rate), 0.0)
 
 
-def _least(enough: Array) -> int | None:
-    """The smallest number of runs from which on all are enough."""
-    short = np.flatnonzero(~enough)
+def _least(enough: Callable[[Indices], Array]) -> int | None:
+    """The smallest number of runs from which on all are enough; None above a million.
+
+    Few numbers are tried first, then all near the last that is not enough: the power of a binomial test is a saw.
+    """
+    tried = np.unique(np.geomspace(1, LARGEST, TRIED).astype(int))
+    short = np.flatnonzero(~enough(tried))
     if not len(short):
         return 1
-    if short[-1] == len(enough) - 1:
+    last = int(short[-1])
+    if last == len(tried) - 1:
         return None
-    return int(short[-1]) + 2
+    near = np.arange(tried[last], tried[min(last + TEETH, len(tried) - 1)] + 1)
+    return int(near[np.flatnonzero(~enough(near))[-1]]) + 1
 
 
 # --- levels that mean a covariance ------------------------------------------------------------------------

@@ -114,8 +114,9 @@ def require_bound_options(r: Reading) -> None:
         raise InputError("--ends: is for bounds; with --gaussian covariances are judged, so leave it out")
     if r.level is not None:
         Levels(r.level)
-        r.refuse("--level", dict.fromkeys(("relative", "align", "truth_covariance", "truth_shared", "axes"),
-                                          ", which is for covariances"))  # fmt: skip
+    if r.level is not None and not r.gaussian:
+        others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
+        r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
 
 
 # --- tables ----------------------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def test_gaffke_is_the_probability_of_a_mixture_by_its_closed_form():
         some = (exact > 1e-3) & (exact < 0.2)
         assert some.sum() > 3
         assert_allclose(found[some], exact[some], rtol=near)
-        assert (found[some] > 0.99 * exact[some]).all()
+        assert (found[some] > 0.97 * exact[some]).all()
     assert gaffke(np.full(10, 0.01), 0.05) == 1.0
 
 

@@ -57,6 +57,7 @@ MODULES = (
     "calibration_lengths",
     "calibration_spread",
     "calibration_groups",
+    "calibration_bounds",
     "calibration_independent",
     "calibration_members",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions

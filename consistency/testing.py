@@ -17,6 +17,7 @@ from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.gating.checked_input import (
     Sides,
+    bound_gate_runs,
     of_arrays,
     of_filters,
     planned_dof,
@@ -57,6 +58,9 @@ def assert_consistent(
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
+    bounds: ArrayLike | None = None,
+    level: str | float | Mapping[str, Any] | None = None,
+    ends: str | None = None,
     filter: str | None = None,
     nees: ArrayLike | None = None,
     dof: ArrayLike | None = None,
@@ -90,6 +94,8 @@ def assert_consistent(
     covariances : (runs, steps, n, n), in the squared units of the errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share, see :func:`consistency.judge`
+    bounds, level, ends : in place of covariances, as for :func:`consistency.judge`: bounds pass where the factor by
+        which they must grow is shown to lie within the root of ``detect``
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances; ``dof`` may be of
         each step, (steps,) or (runs, steps), where the state grows or shrinks
     false_alarm : probability of rejecting a correct filter; 0.001 unless an argument, marker or session sets it
@@ -130,7 +136,8 @@ def assert_consistent(
     __tracebackhide__ = True
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     arrays: dict[str, Any] = {
-        "covariances": covariances, "deviations": deviations, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
+        "covariances": covariances, "deviations": deviations, "bounds": bounds, "level": level, "ends": ends,
+        "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
@@ -287,6 +294,8 @@ def _judged(
         return GateResult(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
+        if record.errors.bounds:
+            return bound_gate_runs(record, replace(demand, false_alarm=rate))
         return gate_runs(
             planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
         )
@@ -350,8 +359,9 @@ def _settle(
             text = few_to_compare(gate, record.name, runs, least, demand)
         else:
             each = replace(demand, false_alarm=demand.false_alarm / rate_shares(record))
-            text = undecided_text(gate, record.name, result.reasons[0], least, dof, each)
-            text += marker_text(dof, runs)
+            level = record.errors.bounds[0].level if record.errors.bounds else None
+            text = undecided_text(gate, record.name, result.reasons[0], least, dof, each, level)
+            text += marker_text(dof, runs) if level is None else ""
         raise InsufficientTrials(text, least, runs, result.verdict)
     return result
 

@@ -236,13 +236,22 @@ def plan_command(
     groups: Annotated[
         int | None, typer.Option("--groups", help="Number of groups of --by, in one of which that ratio must be found.")
     ] = None,
+    level: Annotated[
+        str | None, typer.Option("--level", help="Runs for bounds of this level, such as 95%, in place of covariances.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
-    from consistency.referee.document.tables import plan_lines
-    from consistency.referee.verdicts.judge_sources import pilots_of_records
+    from consistency.referee.document.tables import bound_plan_lines, plan_lines
+    from consistency.referee.verdicts.judge_sources import pilots_of_records, plan_of_bounds
     from consistency.referee.verdicts.judge_sources import plan as plan_runs
 
+    if level is not None:
+        if scenario is not None or like is not None or lost is not None or groups is not None or allow is not None:
+            raise InputError("--level: goes with --detect, --false-alarm and --power alone; it needs no pilot")
+        of_bounds = plan_of_bounds(level, detect, false_alarm, power)
+        print(json.dumps(of_bounds, indent=2) if as_json else "\n".join(bound_plan_lines(of_bounds)))
+        return
     if scenario is not None and like is not None:
         raise InputError("give either a SCENARIO for a pilot or --like RESULTS")
     if filters and scenario is None and like is None:

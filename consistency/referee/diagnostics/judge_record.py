@@ -65,6 +65,10 @@ def judge(
         return follow(design, record.first_runs, len(record.run_numbers), kept)[0]
     if record.guesses:
         return _judge_conventions(record, settings, kept)
+    if record.errors.bounds:
+        from consistency.referee.diagnostics.questions.bounds import findings_of_bounds
+
+        return _whole(record, findings_of_bounds(record, settings), record=kept)
     evidence = record.as_runs
     truth = None
     unshown = record.origin.unshown
@@ -124,7 +128,7 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
 
 def _causes_of_level(found: Findings) -> list[str]:
     """Usual levels that would explain a covariance that is too large; their module is loaded for it."""
-    if found.status != "conservative":
+    if found.status != "conservative" or found.bounds:
         return []
     from consistency.referee.diagnostics.words.faults import level_causes
 

@@ -113,10 +113,21 @@ def factor(v: Verdict) -> Quantity:
 
 
 def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
-    """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole."""
+    """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole; of bounds their
+    factor."""
+    if v.bounds:
+        return _factor_of_bound(v)
     if v.status == "biased" and v.bias is not None and v.bias.inflation_without is not None:
         return f"{ratio_text(v.bias.inflation_without)} about the mean"
     return whole if v.axis is None else f"{ratio_text(v.axis[1])} in {v.axis[0]}"
+
+
+def _factor_of_bound(v: Verdict) -> str:
+    """Factor of the bound at fault that is clearest, or of the one that is farthest from right."""
+    from consistency.referee.diagnostics.words.bounds import deciding, factor_text
+
+    one = deciding(v.bounds)
+    return f"{factor_text(one.factor)} x {one.name}"
 
 
 def shown_inside(v: Verdict) -> Cell:
@@ -171,7 +182,7 @@ BRIEF = (
     ),
 )
 TERMINAL = (
-    Measure(Column("verdict"), lambda v: Status(v.status, " (NIS only)" if v.scale is None else "")),
+    Measure(Column("verdict"), lambda v: Status(v.status, " (NIS only)" if v.scale is None and not v.bounds else "")),
     Measure(Column("ANEES", number=True), lambda v: _mean_anees(v, ".2f")),
     Measure(
         Column("true / stated", number=True),
@@ -264,6 +275,11 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("shown inside", f"{ends}: {'yes' if shown.shown else 'no'} (p {p_text(shown.p_value)}){of_all}"))
         if v.lost is not None:
             rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
+    for one in v.bounds:
+        from consistency.referee.diagnostics.words.bounds import factor_text, level_text
+
+        outside = f"outside in {percent(one.rate)} of the steps at {level_text(one.level)}"
+        rows.append((one.name, f"factor {factor_text(one.factor)}, {outside}"))
     if v.accuracy is not None and v.axes is not None and np.isfinite(v.accuracy.coverage).any():
         inside = (f"{axis} {100 * c:.1f} %" for axis, c in zip(v.axes.names, v.accuracy.coverage, strict=True))
         rows.append(("2-sigma coverage", ", ".join(inside)))
@@ -435,6 +451,27 @@ def rejection_text(r: RejectionScore) -> str:
 def _percent_text(share: Interval) -> str:
     value, low, high = (f"{100 * end:.3g}" for end in share)
     return f"{value if value != 'nan' else '-'} [{low}, {high}] %"
+
+
+def bound_plan_lines(planned: dict[str, Any]) -> list[str]:
+    """Runs that bounds of a level take, a line for each thing to be shown."""
+    from consistency.referee.diagnostics.words.bounds import level_text
+
+    p = planned
+    level, factor, power = level_text(p["level"]), f"{p['detect']:.3g}", p["power"]
+    near = f"between {short(p['detect'] ** -0.5)} and {short(p['detect'] ** 0.5)}"
+
+    def runs(key: str) -> str:
+        return "more than a million" if p[key] is None else str(p[key])
+
+    return [
+        f"{runs('consistent')} runs show that the factor of a right bound of {level} is {near}, with power {power:g}, "
+        "however steps depend on each other",
+        f"{runs('small')} runs find a bound too small by x{factor} at false alarm {p['false_alarm']:g} with that power",
+        f"{runs('large')} runs find a bound too large by x{factor}",
+        f"with fewer than {p['fewest']} runs no bound of {level} is shown to hold or to be too large, as all may stay "
+        "inside",
+    ]
 
 
 def plan_lines(planned: dict[str, Any]) -> list[str]:

@@ -18,8 +18,11 @@ from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, R
 from consistency.referee.diagnostics.questions.whiteness import nis_of
 from consistency.referee.diagnostics.records.record import InnovationRecord, Record, Skip, skip_of
 from consistency.referee.errors import InputError
+from consistency.referee.gating.session import Terms
 from consistency.referee.readers.formats.archives import steps_of
+from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
+from consistency.referee.readers.pipeline.read_files import checked_options
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.judge_sources import Source
@@ -35,6 +38,9 @@ def record_of_checked(
     errors: ArrayLike | None = None,
     covariances: ArrayLike | None = None,
     deviations: ArrayLike | None = None,
+    bounds: ArrayLike | None = None,
+    level: str | float | Mapping[str, Any] | None = None,
+    ends: str | None = None,
     nees: ArrayLike | None = None,
     dof: ArrayLike | None = None,
     nis: ArrayLike | None = None,
@@ -47,11 +53,15 @@ def record_of_checked(
     skip: str | float | Skip | None = None,
 ) -> Record:
     """One estimator with checked arrays; arguments and errors as :func:`consistency.testing.assert_consistent`."""
-    if covariances is not None and deviations is not None:
-        raise ValueError("give covariances or deviations, not both")
-    key, size = "covariances", covariances
-    if deviations is not None:
-        key, size = "deviations", deviations
+    sizes = {"covariances": covariances, "deviations": deviations, "bounds": bounds}
+    there = [name for name, value in sizes.items() if value is not None]
+    if len(there) > 1:
+        raise ValueError(f"give {' or '.join(there)}, not both")
+    key = there[0] if there else "covariances"
+    size = sizes[key]
+    options = Reading(level=level, ends=ends)
+    if options.given() and bounds is None:
+        raise ValueError("level and ends go with bounds")
     if errors is None and size is not None:
         raise ValueError(f"{key} without errors: give both")
     if errors is not None and size is None:
@@ -71,7 +81,7 @@ def record_of_checked(
         given["dof"] = dof
     stated = {key: value for key, value in given.items() if value is not None}
     if stated:
-        record = record_of_arrays(stated, axes, name)
+        record = record_of_arrays(stated, axes, name, reading=checked_options(options))
         if nees is None and dof is not None and dof != record.errors.dof:
             raise ValueError(f"dof is {dof}, but the errors have {record.errors.dof} components")
     of_gain, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
@@ -87,6 +97,14 @@ def record_of_checked(
         return record.without_first(skip_of(skip))
     except InputError as error:
         raise ValueError(str(error).removeprefix("--")) from None
+
+
+def bound_gate_runs(record: Record, terms: Terms) -> int:
+    """Runs with which a gate passes right bounds, however steps depend on each other; a million at most."""
+    from consistency.referee.diagnostics.statistics.exceedance import LARGEST, bound_runs
+
+    each = [bound_runs(bound.level, terms.detect, terms.false_alarm, terms.power) for bound in record.errors.bounds]
+    return max(one.consistent or LARGEST for one in each)
 
 
 def planned_dof(record: Record) -> int:

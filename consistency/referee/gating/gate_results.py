@@ -97,6 +97,11 @@ def summary_of(result: GateResult) -> dict[str, Any]:
     assert result.verdict is not None
     verdict = result.verdict
     axis, ratio = verdict.axis or (None, ())
+    if verdict.bounds:
+        from consistency.referee.diagnostics.words.bounds import deciding
+
+        bound = deciding(verdict.bounds)
+        axis, ratio = bound.name, bound.factor
     rest: dict[str, Any] = plain({
         "statistic": verdict.statistic, "threshold": verdict.threshold, "inflation": verdict.inflation,
         "inflation_interval": verdict.inflation_interval, "axis": axis, "axis_ratio": ratio,

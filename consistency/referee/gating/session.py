@@ -188,10 +188,10 @@ def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
     return "\n  - ".join([f"{gate}: {with_subject(name, first)}", *rest])
 
 
-def plan_invocation(dof: int, terms: Terms) -> str:
+def plan_invocation(dof: int, terms: Terms, level: float | None = None) -> str:
+    what = f"--dof {dof}" if level is None else f"--level {100.0 * level:.9g}%"
     text = (
-        f"consistency plan --dof {dof} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} "
-        f"--power {terms.power!r}"
+        f"consistency plan {what} --detect {terms.detect!r} --false-alarm {terms.false_alarm!r} --power {terms.power!r}"
     )
     if terms.allow:
         text += f" --allow {terms.allow}"
@@ -200,14 +200,16 @@ def plan_invocation(dof: int, terms: Terms) -> str:
     return text
 
 
-def undecided_text(gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms) -> str:
+def undecided_text(
+    gate: str, name: str, sentence: str, needed: int, dof: int, terms: Terms, level: float | None = None
+) -> str:
     """Neither a fault nor that there is none: how many runs to simulate, and where the number comes from."""
     larger = "a larger detect"
     if terms.lost is not None:
         larger += " and a larger lost"
     return (
         f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
-        f"however the steps depend on each other: {plan_invocation(dof, terms)}"
+        f"however the steps depend on each other: {plan_invocation(dof, terms, level)}"
     )
 
 
@@ -325,6 +327,8 @@ def needed_at(entry: Entry, rate: float) -> int:
     from consistency.referee.diagnostics.comparison import Comparison
     from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 
+    if not entry.dof:  # of bounds, whose number does not depend on the rate
+        return entry.needed
     if entry.standard_error is None:
         return gate_runs(entry.dof, entry.detect, rate / entry.parts, entry.power, entry.allow, entry.lost)
     comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)

@@ -22,7 +22,7 @@ from consistency.referee.readers.formats.archives import UNWEIGHTED
 from consistency.referee.readers.options import REPEATS, Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
-from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
+from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
@@ -52,6 +52,9 @@ def read(
     truth_covariance: str | Path | None = None,
     truth_errors: str | None = None,
     truth_shared: bool = False,
+    level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
+    ends: str | None = None,
     by: str | None = None,
     by_file: str | Path | None = None,
     bins: int | Sequence[float] | None = None,
@@ -96,6 +99,10 @@ def read(
     truth_errors : how errors of the truth depend on each other: "independent", "per-run", or "common" to all runs; with
         None only what holds under any dependence is said
     truth_shared : the estimator has fused the truth
+    level : of bounds, radii and intervals in columns ``bound_x``, ``radius_x_y``, ``x_low`` and ``x_high``, or the key
+        ``bounds``: 0.95, "95%", "2sigma", "CEP"; or by name, ``{"bound_x": 0.95}``
+    gaussian : read them, or deviations at that level, as the covariance of a Gaussian, circular for radii
+    ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
     by : column whose values make groups, in each of which the size of the errors is judged, too: words as they are,
         numbers in quantile bins. It was fixed before the error was: a setting, the environment, time, what had been
         measured so far
@@ -123,7 +130,7 @@ def read(
         time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
         motions=motions or None, windows=windows, independent=independent or None, align=align,
         lever_arm=lever_arm, split=split, truth_covariance=of_truth, truth_errors=truth_errors,
-        truth_shared=truth_shared or None,
+        truth_shared=truth_shared or None, level=level, gaussian=gaussian or None, ends=ends,
         by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
         columns=columns, truth_columns=truth_columns,
         world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
@@ -148,6 +155,10 @@ def judge(
     members: ArrayLike | None = None,
     truth: ArrayLike | str | None = None,
     ensemble: int | None = None,
+    bounds: ArrayLike | None = None,
+    level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
+    ends: str | None = None,
     axes: Sequence[str] | None = None,
     independent: bool = False,
     name: str = "estimator",
@@ -177,6 +188,14 @@ def judge(
     truth : (runs, steps, n), of members; or "repeats": ``record`` holds estimates (runs, steps, n) of the same true
         values in every run, which nobody knows
     ensemble : number of members whose sample covariances these are, and whose mean the errors are about
+    bounds : (runs, steps, n), in place of covariances, bounds on the size of each component; or (runs, steps), on the
+        length of all, such as a horizontal radius. The question is then whether errors leave them as often as their
+        level says
+    level : share of the steps in which the error stays inside a bound: 0.95, "95%", "2sigma", "CEP", or by name,
+        ``{"bound_x": 0.95}``
+    gaussian : bounds, or deviations and covariances at that level, stand for the covariance of a Gaussian, which is
+        judged
+    ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
     axes : (n,) names of the components of errors
     independent : each row is an independent run of one step. Errors may then be (N, n), with covariances (N, n, n) or
         deviations (N, n); of a path its rows are runs
@@ -197,29 +216,32 @@ def judge(
         A setting out of its range, or nothing is left; shapes that do not fit, a covariance that is not symmetric, a
         step that is not finite in any run.
     """
-    given = {"covariances": covariances, "deviations": deviations}
+    given = {"covariances": covariances, "deviations": deviations, "bounds": bounds}
     stated = {key: value for key, value in given.items() if value is not None}
     if len(stated) > 1:
-        raise InputError("covariances, deviations: give one of them beside errors")
+        raise InputError(f"{', '.join(stated)}: give one of them beside errors")
     if "weights" in settings:
         raise InputError(f"weights: {UNWEIGHTED}")
+    options = Reading(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble)
+    if bounds is not None or options.given(("level", "gaussian", "ends")):
+        options = checked_options(options)
     if members is not None:
         if truth is None or isinstance(truth, str) or record is not None or stated:
             raise InputError("members: need truth=, (runs, steps, n), beside them, and nothing else")
-        record = record_of_arrays({"members": members, "truth": truth}, axes, name, independent, ensemble)
+        record = record_of_arrays({"members": members, "truth": truth}, axes, name, independent, options)
     elif truth is not None:
         if not isinstance(truth, str) or truth != REPEATS or not stated:
             raise InputError("truth: goes with members=; or is 'repeats', beside estimates with covariances")
         given_estimates = {"estimates": cast(ArrayLike, record), **stated}
-        record = record_of_arrays(given_estimates, axes, name, independent, ensemble)
+        record = record_of_arrays(given_estimates, axes, name, independent, options)
     elif stated:
         stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
-        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent, ensemble)
+        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent, options)
         options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
         require_truth_options(options)
         (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
-        record = read(record, independent=independent)
+        record = read(record, independent=independent, level=level, gaussian=gaussian, ends=ends)
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
     elif independent:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict.parts import ABOUT, MAIN, Answer
+from consistency.referee.diagnostics.verdict.parts import ABOUT, MAIN, Answer, BoundScore
 from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.words.bounds import level_text
 from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import (
@@ -46,6 +47,7 @@ FAILURES = (
 STEP_1 = "A run that failed in step 1 has no estimates; a hang or a crash is counted there, in whatever step it was."
 FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
 MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}
+OUTSIDE = "share of the steps of a run in which the error is outside, against 1 - level"
 NARROW = 4  # filters beside which the questions have less room
 EPOCH = 1e6  # s; times beyond are shown from the first on
 DECADE = 10.0  # values that span more are drawn on a log axis
@@ -64,6 +66,37 @@ def judgement(study: Judged) -> list[Block]:
         failed = f"Failed runs of {study.name}"
         blocks.append(table(FAILURES, rows, failed, caption=f"{failed}: {len(rows)}. {STEP_1}"))
     return blocks
+
+
+BOUNDS = (
+    Column("Bound", width="2fr"),
+    Column("Verdict"),
+    Column("Level", number=True),
+    Column("Inside (%)", number=True),
+    Column("Above (%)", number=True),
+    Column("Below (%)", number=True),
+    Column("Rate outside that is excluded (%)", "Excluded\noutside (%)", number=True),
+    Column("Factor by which it must grow", "Factor", number=True),
+)
+
+
+def bounds_tables(study: Judged) -> list[Block]:
+    """Coverage and factor of each bound and group, a table for each estimator that states bounds."""
+    tables: list[Block] = []
+    for track in study.tracks:
+        rows = [_bound_cells(score) for score in track.verdict.bounds]
+        if rows:
+            label = f"Bounds of {track.name}"
+            tables.append(table(BOUNDS, rows, label, caption=f"{label}: how often the error stays inside."))
+    return tables
+
+
+def _bound_cells(score: BoundScore) -> tuple[Cell, ...]:
+    shares = (1.0 - score.rate, score.above, score.below, score.rate_limit)
+    inside, above, below, limit = (blocks.Quantity(100.0 * share, digits=".3g") for share in shares)
+    factor = blocks.Quantity(score.factor.value, score.factor[1:], is_factor=True)
+    status = blocks.Status(score.status or "not judged")
+    return score.name, status, level_text(score.level), inside, above, below, limit, factor
 
 
 def equivalence_interval(study: Judged) -> str:
@@ -90,8 +123,12 @@ def verdicts_caption(study: Judged) -> str:
     if study.until_decided:
         when = [f"{track.name} after {plural(track.verdict.runs, 'run')}" for track in study.tracks]
         text += f", until decided: a verdict is that of the look that decided, {names_in_a_row(when)}"
-    what = "of true to stated covariance" if study.has_truth else "of the NIS to its degrees of freedom"
-    text += f". Shown inside {equivalence_interval(study)}: whether the ratio {what} is shown to lie there"
+    what = "the ratio of true to stated covariance"
+    if study.of_bounds:
+        what = "the factor by which bounds must grow"
+    elif not study.has_truth:
+        what = "the ratio of the NIS to its degrees of freedom"
+    text += f". Shown inside {equivalence_interval(study)}: whether {what} is shown to lie there"
     if len(study.judged) < len(study.tracks):
         text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
     if own := study.own_errors:
@@ -121,10 +158,18 @@ def method(studies: Sequence[Judged]) -> str:
         text += _consistent(tracks[0])
     conditions = (
         (
-            any(study.has_truth for study in studies),
+            any(study.has_truth and not study.of_bounds for study in studies),
             " Half of the false-alarm rate belongs to the mean NEES of whole runs, for which the number of runs is "
             "planned; the other questions share the rest. Where a fault was absent before some step, the factor and "
             "the axes are those since that step.",
+        ),
+        (
+            any(study.of_bounds for study in studies),
+            " Bounds are judged by the share of the steps of each run in which the error is outside. A fault is found "
+            "by Gaffke's test (2005), whose rate is measured, and up to a false-alarm rate of .001 by a bet against "
+            "the bound (Waudby-Smith & Ramdas 2024), whose rate is proved. Steps after the end of a run count as "
+            "inside for 'too small' and as outside for 'too large'. The factor is that by which the bound must grow, "
+            "with its 95 % interval by inversion of the test.",
         ),
         (
             any(not study.has_truth for study in studies),
@@ -152,13 +197,16 @@ def method(studies: Sequence[Judged]) -> str:
 def _consistent(track: Estimator) -> str:
     """What consistent and undecided mean."""
     settings, shown = track.verdict.settings, track.verdict.equivalence
-    upper = short(settings.factor)
-    tests, inside = "two one-sided tests, each", f"between {short(1.0 / settings.factor)} and {upper}"
+    factor, what = settings.factor, "the ratio of true to stated covariance"
+    if track.verdict.bounds and shown is not None:
+        factor, what = shown.factor, "the factor by which each bound must grow"
+    upper = short(factor)
+    tests, inside = "two one-sided tests, each", f"between {short(1.0 / factor)} and {upper}"
     if (settings if shown is None else shown).one_sided:
         tests, inside = "a one-sided test", f"below {upper}"
     return (
         f" Consistent is shown: no question found a fault, and {tests} at {100 * (1.0 - settings.power):.2g} %, put "
-        f"the ratio of true to stated covariance {inside}. With neither a fault nor that, a filter is undecided: its "
+        f"{what} {inside}. With neither a fault nor that, a filter is undecided: its "
         "sentence has the ratio, its interval, and the number of runs that would probably decide."
     )
 
@@ -180,7 +228,7 @@ def asked(study: Judged) -> tuple[Question, ...]:
     for name in dict.fromkeys(known):
         given = tuple(answers.get(name) for answers in by_filter)
         if any(answer is not None for answer in given):
-            questions.append(Question(name, ABOUT.get(name, ""), given))
+            questions.append(Question(name, ABOUT.get(name, OUTSIDE if study.of_bounds else ""), given))
     return tuple(questions)
 
 
@@ -303,7 +351,12 @@ class Judged:
 
     @property
     def has_truth(self) -> bool:
-        return any(track.verdict.scale is not None for track in self.tracks)
+        return self.of_bounds or any(track.verdict.scale is not None for track in self.tracks)
+
+    @property
+    def of_bounds(self) -> bool:
+        """Whether bounds are judged in place of covariances."""
+        return any(track.verdict.bounds for track in self.tracks)
 
     @property
     def single(self) -> bool:

@@ -243,7 +243,7 @@ def compose_files(
         for i, (name, verdict) in enumerate(judged.items())
     ]
     blocks = (
-        *verdicts.judgement(study), *questions_table.diagnosis(study), *by_axis(study),
+        *verdicts.judgement(study), *verdicts.bounds_tables(study), *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].origin.notes))

@@ -309,6 +309,9 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
     if r.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
+    if r.level is not None and not r.gaussian:
+        raise InputError("--level: monte-carlo judges covariances; add --gaussian, or judge bounds of the kept runs "
+                         "with 'consistency analyse'")  # fmt: skip
     if IS_WINDOWS:
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)

@@ -128,6 +128,16 @@ class Reading:
     )
     truth_errors: str | None = _option("Dependence of the truth's errors: independent, per-run, or common to all runs.")
     truth_shared: bool | None = _option("Declare that the estimator has fused the truth.", flag="--truth-shared/")
+    level: str | float | Mapping[str, Any] | None = _option(
+        "Level of bounds, radii and intervals: 95%, 2sigma, CEP; or bound_x=95%,radius_x_y=68%.", "LEVEL", str
+    )
+    gaussian: bool | None = _option(
+        "Read them (or deviations) at that --level as the covariance of a Gaussian, circular for radii.",
+        flag="--gaussian/",
+    )
+    ends: str | None = _option(
+        "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."
+    )
     by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
     by_file: Path | None = _option("Table with that column and t, run or both.")
     bins: int | Sequence[float] | None = _option(

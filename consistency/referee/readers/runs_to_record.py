@@ -54,7 +54,16 @@ NO_ERROR = 1e-9  # m or rad: rounding of what is not estimated
 NO_CHANGE = 1e-6  # m or rad: rounding, to four bytes or in a text, of a height or a tilt that never changes
 FEWEST = 3  # rows of a run that show that
 BESIDE = 1.0  # s, of the truth before and after the estimates
-ARRAYS = ("error", "covariance", "nis", "nis_dof", "truth_covariance", "path", "by")  # of a track, as in a record
+ARRAYS = (
+    "error",
+    "covariance",
+    "nis",
+    "nis_dof",
+    "truth_covariance",
+    "path",
+    "by",
+    "bound_ratios",
+)  # of a track, as in a record
 UNITS = {"": "step", "s": "s", "m": "m"}
 FORMS = "a whole number of steps (100), seconds (10s) or metres along the true path (50m)"
 ROUNDING = 1e-6  # of steps, s or m: a double holds the seconds since 1970 to a quarter of that
@@ -81,6 +90,7 @@ class Track:
     truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
     by: Array | None = None  # (k,), values of the column that makes groups
+    bound_ratios: Array | None = None  # (k, bounds), errors over their bounds
 
     def part(self, index: Sequence[int]) -> Track:
         assert self.error is not None

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.record import Bound
 from consistency.referee.diagnostics.records.whitening import ROUNDED
 from consistency.referee.geometry import planar_error, wrap
 from consistency.referee.readers.places import Places
@@ -153,8 +154,8 @@ def _bends(position: Array, after: Indices) -> Array:
     return np.asarray(np.maximum(second(after), second(after + 1)) / 8.0)
 
 
-OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "by", "apart", "bend",
-                "members")  # fmt: skip
+OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "bounds", "by", "apart",
+                "bend", "members")  # fmt: skip
 OF_TRUTH = ("true_t", "truth", "true_clock", "true_covariance")
 
 
@@ -186,6 +187,7 @@ class Poses:
     nis: Array | None = None  # (N,)
     nis_dof: Array | None = None  # (N,)
     members: Array | None = None  # (N, m, n), whose mean the estimate is; the error is then that of their ranks
+    bounds: Array | None = None  # (N, bounds, 2), distance from the estimate to the lower and upper end of bounds
     by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
     apart: Array | None = None  # (N,), s to the nearest sample of a truth that was matched
@@ -364,6 +366,15 @@ _EACH = {f" {axis}": slice(i, i + 1) for i, axis in enumerate(AXES)}
 SINGLE = Stated({**_EACH, " velocity and biases": slice(6, None)}, alone=True)
 
 
+class Bounds(NamedTuple):
+    """Bounds on components of the error, which an estimator states in place of a covariance."""
+
+    bounds: tuple[Bound, ...]
+    index: tuple[tuple[int, ...], ...]  # of each its components, by their places in the error
+    deviations: tuple[float, ...]  # of each how many standard deviations of a Gaussian it has at its level
+    gaussian: bool  # declared: they stand for the covariance of one
+
+
 @dataclass(frozen=True)
 class Estimator:
     """The runs of one estimator, with what its record is called and what a reader must know of it."""
@@ -385,6 +396,7 @@ class Estimator:
     t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
     innovations_alone: bool = False  # there is no truth
     assumed: bool = False  # its covariance is I, as the files state none
+    bounds: Bounds | None = None  # that are stated in place of covariances
     failed: Mapping[int, str] = field(default_factory=dict)  # runs without estimates, and why they have none
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 

@@ -241,6 +241,10 @@ def baseline(
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
     for each in source.filters:
         record = source.record(each).without_first(first)
+        if record.errors.bounds:
+            raise InputError(
+                f"{record.name}: bounds are judged by 'analyse'; with --gaussian they are read as covariances"
+            )
         if record.errors.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
         of_runs |= record.runs.trials

@@ -208,6 +208,29 @@ def plan(
     return planned
 
 
+def plan_of_bounds(level: str | float, detect: float, false_alarm: float, power: float) -> dict[str, Any]:
+    """Runs that bounds of a ``level`` take, however steps depend on each other.
+
+    Returns
+    -------
+    The options, with ``fewest``, ``consistent``, ``small`` and ``large`` of
+    :class:`~consistency.referee.diagnostics.statistics.exceedance.BoundRuns`
+
+    Raises
+    ------
+    InputError
+        A number out of its range.
+    """
+    from consistency.referee.diagnostics.statistics.exceedance import bound_runs
+    from consistency.referee.readers.formats.bounds import level_of_text
+
+    settings = settings_of(detect=detect, false_alarm=false_alarm, power=power)
+    stated = level_of_text(level)
+    share = stated.of(stated.dimensions or 1)
+    asked = {"level": share, "detect": settings.factor, "false_alarm": false_alarm, "power": power}
+    return asked | bound_runs(share, detect, false_alarm, power)._asdict()
+
+
 def pilots_of_records(
     records: Sequence[Record], filters: Sequence[str] | None = None
 ) -> tuple[dict[str, tuple[Array, int]], int]:

@@ -11,6 +11,7 @@ from records import changed
 import consistency as cs
 from consistency.diagnostics import (
     Design,
+    Errors,
     MapRecord,
     Rejections,
     Settings,
@@ -43,7 +44,7 @@ RUNS = 24
 def record(scale=1.0, **more):
     error = scale * independent(np.random.default_rng(5), RUNS, 4, 3)
     nees = np.square(error).sum(axis=-1)
-    return make_record("f", error, identities(error), nees, axes=("x", "y", "heading"), **more)
+    return changed(make_record("f", error, identities(error), nees, axes=("x", "y", "heading")), **more)
 
 
 def map_of(runs):
@@ -64,7 +65,7 @@ def whole_record():
     counts = (np.full(RUNS, n) for n in (10, 4, 3, 2))
     return record(
         convention="left", align="", caption="as fitted", causes=("a probable mix-up",), notes=("a note",),
-        world=make_record("f", 3.0 * error, identities(error)), map=lambda: map_of(RUNS),
+        world=Errors(3.0 * error, identities(error)), map=lambda: map_of(RUNS),
         rejections=Rejections(np.arange(RUNS), *counts),
     )  # fmt: skip
 

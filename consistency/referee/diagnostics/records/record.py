@@ -71,6 +71,15 @@ class Rejections(NamedTuple):
         return Rejections(*(column[some] for column in self))
 
 
+class Bound(NamedTuple):
+    """A bound on the size of one component of the error, or on the length of several."""
+
+    name: str  # of its column: bound_x, radius_x_y
+    components: tuple[str, ...]
+    level: float  # share of the steps in which the error is inside
+    ends_independent: bool = False  # declared: where runs end, and which are lost, does not depend on the errors
+
+
 class Ensemble(NamedTuple):
     """Members of all runs and steps, as they are drawn."""
 
@@ -124,8 +133,10 @@ class Errors:
     convention: str = ""  # of the error
     tables: Sequence[RatioTable] = ()  # (n,), what mean squares of normal numbers say of the covariance; () of errors
     ensemble: Ensemble | None = None  # what is drawn of it
+    bounds: tuple[Bound, ...] = ()  # that are judged in place of covariances
+    bound_ratios: Array | None = None  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
 
-    OF_RUNS: ClassVar = ("error", "covariance", "nees")
+    OF_RUNS: ClassVar = ("error", "covariance", "nees", "bound_ratios")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -248,7 +259,13 @@ class Record:
         """Labels of the runs, (runs,)."""
         if self.runs.numbers is not None:
             return self.runs.numbers
-        there = (self.errors.error, self.errors.nees, self.innovations.nis, self.innovations.values)
+        there = (
+            self.errors.error,
+            self.errors.nees,
+            self.innovations.nis,
+            self.innovations.values,
+            self.errors.bound_ratios,
+        )
         return np.arange(next((len(array) for array in there if array is not None), 0))
 
     def table(self, index: Sequence[int] | None = None) -> RatioTable | None:
@@ -330,6 +347,7 @@ class Record:
             "nis": self.innovations.nis,
             "nis_dof": self.innovations.nis_dof,
             "values": self.innovations.values,
+            "bound_ratios": self.errors.bound_ratios,
         }
         if self.world is not None:
             arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
@@ -345,7 +363,9 @@ class Record:
             world = replace(world, covariance=rest["world covariance"], nees=rest["world nees"])
         return replace(
             self,
-            errors=replace(self.errors, covariance=rest["covariance"], nees=rest["nees"]),
+            errors=replace(
+                self.errors, covariance=rest["covariance"], nees=rest["nees"], bound_ratios=rest["bound_ratios"]
+            ),
             innovations=replace(self.innovations, nis=rest["nis"], nis_dof=rest["nis_dof"], values=rest["values"]),
             runs=replace(self.runs, skipped=skipped),
             world=world,

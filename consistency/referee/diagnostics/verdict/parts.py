@@ -209,6 +209,27 @@ class ByGroup:
 
 
 @dataclass(frozen=True)
+class BoundScore:
+    """How often the error leaves a bound, of all steps or of a group of them, and the factor that it needs."""
+
+    name: str  # of the bound; with its group where it is of one
+    level: float  # share of the steps in which the error is to stay inside
+    factor: Interval  # by which the bound has to grow for its level to hold, 95 %; infinite where no end is known
+    rate: float  # mean over runs of the share of steps outside
+    rate_limit: float  # rates from here on are excluded at 95 %
+    above: float  # share of steps above the upper bound; NaN of a length
+    below: float
+    runs: int
+    steps: int  # of all runs
+    missing: int  # steps after the end of runs, and of lost ones
+    fewest: int  # runs below which neither consistent nor conservative can be shown
+    p_value: float  # corrected for all bounds and groups
+    equivalence: Equivalence  # of the factor
+    status: str  # overconfident, conservative, consistent or undecided; "" where it is not judged
+    group: str = ""
+
+
+@dataclass(frozen=True)
 class Lost:
     """Runs that failed, or whose mean NEES is beyond the limit for a right run."""
 
@@ -490,15 +511,21 @@ class Settings:
         return self.allow == "conservative"
 
 
-def answers(p_values: Mapping[str, float], false_alarm: float) -> dict[str, Answer]:
+def answers(
+    p_values: Mapping[str, float], false_alarm: float, shares: Mapping[str, float] | None = None
+) -> dict[str, Answer]:
     """Answers corrected for the number of questions: weighted Holm (1979), valid under any dependence.
 
     The probability that a right filter is found at fault in any question is at most ``false_alarm``. The main question
     keeps its share; the shares of questions that cannot be asked (p is NaN) go to the other ones. The
     adjusted p value of a question is the false-alarm rate at which it would just be found.
+
+    Parameters
+    ----------
+    shares : of the false-alarm rate of each question that is asked, adding to 1; those of ``SHARES`` if not given
     """
     asked = {question: p for question, p in p_values.items() if np.isfinite(p)}
-    share = shares_of(asked)
+    share = shares or shares_of(asked)
     found: dict[str, Answer] = {}
     left = 1.0
     least = 0.0

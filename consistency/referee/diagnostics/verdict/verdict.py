@@ -19,6 +19,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     Accuracy,
     Answer,
     Bias,
+    BoundScore,
     ByGroup,
     ComponentRatios,
     EarlyEnds,
@@ -77,6 +78,7 @@ class Findings:
     ends: EarlyEnds | None = None  # runs that end before the others; None where none does, and of maps
     skipped: Skipped | None = None  # first steps of each run that were left out
     truth: TruthShare | None = None  # where the truth has a covariance of its own
+    bounds: tuple[BoundScore, ...] = ()  # where bounds are judged in place of covariances
     parts: Mapping[str, Findings] = field(default_factory=dict)  # where cross terms between them are not stated
     unshown: str = ""  # why nothing can be shown, so that nothing is decided
     later: bool = False  # this look found no fault; it asks the scale alone, or has too few runs for an all-clear
@@ -188,7 +190,7 @@ class Findings:
             return self.scale.equivalence
         if self.innovations is not None:
             return self.innovations.equivalence
-        return None
+        return max((one.equivalence for one in self.bounds), key=lambda shown: shown.p_value, default=None)
 
     @property
     def first_step(self) -> int | None:
@@ -353,6 +355,7 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
         (v.guesses or None, _guess_numbers),
         (v.truth, truth_numbers),
         (v.by_group, group_numbers),
+        (v.bounds or None, bound_numbers),
     ]
     for part, numbers_of in parts:
         if part is not None:
@@ -497,6 +500,14 @@ def truth_numbers(truth: TruthShare) -> Numbers:
         "truth_errors": truth.errors,
         "truth_shared": truth.shared,
     }
+
+
+def bound_numbers(bounds: tuple[BoundScore, ...]) -> Numbers:
+    scores = []
+    for one in bounds:
+        numbers = vars(one) | {"factor": one.factor.value, "factor_interval": tuple(one.factor[1:])}
+        scores.append(numbers | {"equivalence": equivalence_numbers(one.equivalence)})
+    return {"bounds": scores}
 
 
 def group_numbers(by: ByGroup) -> Numbers:

@@ -101,6 +101,10 @@ def details(v: Findings) -> list[str]:
 
 def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
     """The sentence on errors, or without truth on innovations, and the figures behind it."""
+    if v.bounds:
+        from consistency.referee.diagnostics.words.bounds import bounds_sentence, lines_of_bounds
+
+        return bounds_sentence(v), lines_of_bounds(v)
     if v.scale is not None and v.scale.judged_steps:
         figures = [*_truth(v), *_early_ends(v), *_levels(v, v.scale), *_single_log(v, v.scale), *_together(v)]
         figures += _coverage(v)

@@ -31,7 +31,7 @@ from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Estimator, Poses, at, manifold_of, unstated
+from consistency.referee.readers.truth_matching import Bounds, Estimator, Poses, at, manifold_of, unstated
 from consistency.referee.types import Array, Failure, Indices
 
 OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
@@ -42,12 +42,15 @@ BY_STEP = TruthFit(  # n NEES / dof of a step with n, the smallest dof, has the 
     unavailable=("distribution",),
     caption="the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
 )
-OPTIONAL = {"nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
+OPTIONAL = {"bounds", "nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
 FEWEST = 10  # runs and steps from which on swapped arrays are looked for
 ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
 ALIKE = 0.5  # correlation from run to run
 UNLIKE = 0.2  # of it, from step to step
-KINDS = "errors and covariances; or estimates, truth and covariances; or members and truth; or nees and dof"
+KINDS = (
+    "errors and covariances, or bounds in place of covariances; or estimates, truth and covariances; or members and "
+    "truth; or nees and dof"
+)
 
 
 UNWEIGHTED = (
@@ -108,6 +111,10 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     if r.unstated and "covariances" not in arrays and own is not None:
         arrays = {**arrays, "covariances": np.broadcast_to(np.eye(own.shape[-1]), (*own.shape, own.shape[-1]))}
     archive = Archive(path, arrays)
+    bounds = sizes = None
+    if "bounds" in archive or r.level is not None:
+        archive, bounds, sizes = _with_bounds(archive, r)
+        arrays = archive.arrays
     kind = _kind(archive, r)
     if kind == OF_NEES:
         found = _of_nees(archive, bool(r.independent))
@@ -152,7 +159,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         T = None
         if of_truth is not None:
             T = symmetric(of_truth[one.run, rows], place)
-        of_steps = {"nis": nis, "nis_dof": dof, "cross": cross, "by": by}
+        of_steps = {"nis": nis, "nis_dof": dof, "cross": cross, "by": by, "bounds": sizes}
         own: dict[str, Any] = {key: at(values, steps_of_run) for key, values in of_steps.items()}
         stated = np.ones(len(P), bool)
         manifold = manifold_of(convention)
@@ -161,7 +168,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     axes = archive.axes(n)
     gap = np.where(there[..., None], truth - estimates, np.nan)
     causes = swapped(path.stem, gap)
-    if convention == "vector":
+    if convention == "vector" and bounds is None:
         remedy = "wrap it to [-pi, pi]"
         if declared and n == 3:
             remedy = "add --error so2, if these are x, y, heading"
@@ -169,7 +176,33 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     if r.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
     definition = PLANAR.get(declared, "")
-    return Estimator(path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps))
+    return Estimator(
+        path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps), bounds=bounds
+    )
+
+
+def _with_bounds(archive: Archive, r: Reading) -> tuple[Archive, Bounds | None, Array | None]:
+    """The archive with covariances for its bounds, these bounds, and their sizes (runs, steps, bounds, 2)."""
+    from consistency.referee.readers.formats import bounds
+
+    where = f"{archive.path}: "
+    arrays = dict(archive.arrays)
+    if "bounds" not in archive:
+        bounds.require_gaussian(str(archive.path), r)
+        if "covariances" in archive:
+            arrays["covariances"] = archive.require_numbers("covariances") * bounds.covariance_factor(r)
+        return replace(archive, arrays=arrays), None, None
+    key = next((key for key in ("errors", "estimates") if key in archive), None)
+    if key is None or "covariances" in archive:
+        raise InputError(f"{where}key 'bounds' goes with errors, or estimates and truth, in place of covariances")
+    shape = archive.array(key, 3).shape
+    sizes = archive.require_numbers("bounds").astype(float)
+    if archive.arrays[key].ndim < 3:  # one run
+        sizes = sizes[None]
+    stated, values = bounds.stated_in_arrays(where, sizes, archive.axes(shape[-1]), shape, r)
+    flat = bounds.covariance_of(stated, values.reshape(-1, *values.shape[2:]), shape[-1])
+    arrays["covariances"] = flat.reshape(*shape, shape[-1])
+    return replace(archive, arrays=arrays), stated, values
 
 
 def _kind(archive: Archive, r: Reading) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import (
     ALONE,
     WHOLE,
+    Bounds,
     Estimator,
     Poses,
     Stated,
@@ -49,7 +50,8 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
     axes = tuple(r.members or r.state or _own_state(estimates, r) or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
     if r.state is None and axes != tuple(POSE):
-        notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its covariance P_* says; --state names another")
+        what = "covariance P_* says" if r.level is None else "bounds say"
+        notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its {what}; --state names another")
     convention = _convention(r.error, axes, truth) if r.members is None else "vector"
     _require_truth(sheet, truth, axes, convention, r)
     key = _key(sheet, truth, r)
@@ -86,6 +88,10 @@ def _both(
     elif r.truth is not None:
         truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
+    if r.level is not None:
+        from consistency.referee.readers.formats.bounds import with_centres
+
+        sheet = with_centres(sheet)
     sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
     is_alone = truth is None and columns.true_columns(sheet, axes) is None
     sheet, of_nis = columns.with_nis(sheet, r.dof, required=is_alone)
@@ -106,11 +112,24 @@ def _both(
 
 
 def _own_state(table: Path | TableRows, r: Reading) -> list[str]:
-    """The state of a table of estimates that names it in its covariance; none of poses."""
+    """The state of a table of estimates that names it in its covariance or its bounds; none of poses."""
     if isinstance(table, TableRows):
-        return columns.stated_state(list(table.renamed(r.columns).data))
-    head = head_of(table, r.columns) if table.suffix.lower() == ".csv" else None
-    return [] if head is None else columns.stated_state(head.names)
+        names = list(table.renamed(r.columns).data)
+    elif table.suffix.lower() == ".csv":
+        head = head_of(table, r.columns)
+        names = [] if head is None else head.names
+    else:
+        names = [] if r.level is None else list(read_sheet(table, r.columns).data)
+    if r.level is not None:
+        from consistency.referee.readers.formats.bounds import require_gaussian, state_of_bounds
+
+        if state := state_of_bounds(names):
+            return state
+        require_gaussian(str(table.path if isinstance(table, TableRows) else table), r)
+    state = columns.stated_state(names)
+    if not state and not covariance_columns(names, POSE).places and not columns.has_nis(names):
+        _require_no_bounds(table.path if isinstance(table, TableRows) else table, names)
+    return state
 
 
 def _sheet(
@@ -262,10 +281,10 @@ def _estimator(
     covariance, known = unstated(len(sheet), len(axes))
     notes = _absent(name, truth, runs, true_runs)
     stated = WHOLE
-    cross = of_truth = None
+    cross = of_truth = bounds = sizes = None
     is_stated = not r.unstated or covariance_columns(list(sheet.data), axes).places
     if not poses_alone and r.members is None and is_stated:
-        covariance, stated, note = _covariance(name, sheet, axes, convention)
+        covariance, stated, bounds, sizes, note = _stated(name, sheet, axes, convention, r)
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])
     if r.relative is not None and not r.motions:
@@ -299,6 +318,7 @@ def _estimator(
         true_clock=_clock(truth),
         nis=nis,
         nis_dof=dof,
+        bounds=sizes,
         by=columns.own_column(sheet, r),
     )
     if r.members is not None:
@@ -313,9 +333,11 @@ def _estimator(
             has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
     definition = PLANAR[convention]
+    judged = None if bounds is None else sorted(set(sum(bounds.index, ())))
     found = Estimator(
-        name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, position=_position(axes)
-    )
+        name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,
+        position=_position(axes), bounds=bounds,
+    )  # fmt: skip
     if r.members is None:
         return found
     from consistency.referee.readers.formats.members import of_members
@@ -348,6 +370,23 @@ def _position(axes: Sequence[str]) -> int:
     return 2 if tuple(axes[:2]) == ("x", "y") else 0
 
 
+def _stated(
+    name: str, sheet: TableRows, axes: tuple[str, ...], convention: str, r: Reading
+) -> tuple[Array, Stated, Bounds | None, Array | None, str]:
+    """Covariances (N, n, n), which of them are stated, bounds in place of them and their sizes, and a note."""
+    if r.level is None:
+        covariance, stated, note = _covariance(name, sheet, axes, convention)
+        return covariance, stated, None, None, note
+    from consistency.referee.readers.formats import bounds
+
+    found = bounds.stated_in(sheet, axes, r)
+    if found is not None:
+        return bounds.covariance_of(*found, len(axes)), WHOLE, *found, ""
+    bounds.require_gaussian(str(sheet.path), r)
+    covariance, stated, note = _covariance(name, sheet, axes, convention)
+    return covariance * bounds.covariance_factor(r), stated, None, None, note
+
+
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:
     """Covariances (N, n, n), which of them are stated, and a note on them."""
     if convention != ADDITIVE and is_pose(axes):
@@ -356,6 +395,8 @@ def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: 
             note = f"{name}: the covariance is that of the columns own_P_*, which are of the filter's own error"
             return own, WHOLE, note
     entries = covariance_columns(list(sheet.data), axes)
+    if not entries.places:
+        _require_no_bounds(sheet.path, list(sheet.data))
     if not entries.without_cross_terms(len(axes)):
         return columns.stated_covariance(sheet, axes, entries), WHOLE, ""
     note = f"{name}: standard deviations without cross terms are stated, so each component is judged by itself"
@@ -369,3 +410,10 @@ def _absent(name: str, truth: TableRows, runs: Array, true_runs: Array) -> list[
         return []
     remedy = "if the filter broke down there, write a row of NaN, so that the failure counts"
     return [f"{name}: no estimates of {plural(len(absent), 'run')} of the truth ({listed(absent)}); {remedy}"]
+
+
+def _require_no_bounds(path: Path, names: Sequence[str]) -> None:
+    """Refuse a table without a covariance that states bounds, but no level."""
+    bounds = [name for name in names if name.startswith(("bound_", "radius_")) or name.endswith("_low")]
+    if bounds:
+        raise InputError(f"{path}: states no covariance, but {bounds[0]}; --level 95% says the level of bounds")

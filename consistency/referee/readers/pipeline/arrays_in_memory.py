@@ -28,7 +28,7 @@ def record_of_arrays(
     axes: Sequence[str] | None,
     name: str,
     independent: bool = False,
-    ensemble: int | None = None,
+    reading: Reading | None = None,
 ) -> Record:
     """Arrays in memory as a record, like those of an archive; see :func:`consistency.judge`.
 
@@ -37,6 +37,7 @@ def record_of_arrays(
     given : errors or estimates with covariances or deviations, or members with truth, or nees with dof; estimates are
         repeats of the same true values. Steps that are masked in a masked array of any
         of them have no truth and do not count
+    options : level of bounds, and what is declared of them
 
     Raises
     ------
@@ -45,7 +46,7 @@ def record_of_arrays(
         finite in any run.
     """
     first = next(iter(given))
-    reading = Reading(ensemble=ensemble)
+    reading = reading or Reading()
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
         if arrays[first].ndim == 3 and first == "errors":  # of runs whose steps are independent, too
@@ -102,14 +103,14 @@ def record_of_arrays(
         record = estimator_of_arrays(Path("arrays"), arrays, reading)
         if isinstance(record, Estimator):
             (record,) = records_of(record, reading)
-        if ensemble is not None or first == "estimates":
+        if reading.ensemble is not None or first == "estimates":
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
 
             record = of_repeats(record) if first == "estimates" else record
-            record = record if ensemble is None else of_ensemble(record, ensemble)
+            record = record if reading.ensemble is None else of_ensemble(record, reading.ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
-    if sigma is not None:
+    if sigma is not None and not record.errors.bounds:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     runs = replace(record.runs, independent=independent)
@@ -140,7 +141,7 @@ def _require_rows(first: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
         raise InputError(text)
     for key, own in shapes.items():
         needs = (*shape, shape[1]) if key.endswith("covariances") else shape
-        if own == needs:
+        if own == needs or (key == "bounds" and own == shape[:1]):
             continue
         remedy = ""
         if own == needs[1:]:

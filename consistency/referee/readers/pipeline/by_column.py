@@ -115,6 +115,13 @@ def _some(count: int, parts: int = 1) -> Indices:
     return evenly(count, max(ENOUGH // parts, 2))
 
 
+def _sizes(record: Record) -> Array | None:
+    """Sizes of errors, (runs, steps): the NEES, or what it would be of bounds; None without truth."""
+    if record.errors.bound_ratios is None:
+        return record.errors.nees
+    return np.asarray(np.square(record.errors.bound_ratios).sum(axis=-1))
+
+
 def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
     """The record with its groups.
 
@@ -125,12 +132,13 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     """
     if record.runs.by is None:
         return record
-    if record.errors.nees is None:
+    sizes = _sizes(record)
+    if sizes is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
     if column.words and r.bins is not None:
         flag = option.replace("by", "bins")
         raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
-    counted = np.isfinite(record.errors.nees)
+    counted = np.isfinite(sizes)
     if not counted.any():
         return record
     some = _some(int(counted.sum()))
@@ -138,7 +146,7 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     error = None
     if record.errors.error is not None:
         error = record.errors.error[run, step]
-    if why := made_from_errors(column.name, record.runs.by[run, step], error, record.errors.nees[run, step]):
+    if why := made_from_errors(column.name, record.runs.by[run, step], error, sizes[run, step]):
         raise InputError(
             f"{option} {column.name}: the column is made from the errors ({why}), and groups of small and of large "
             "errors differ in any estimator; take a column that was fixed before the error was, or rename one that is "
@@ -196,11 +204,12 @@ def with_groups(
         by = {"array": by}
     if len(by) != 1:
         raise InputError(f"by: one name with its values, {{'n_matches': array}}; got {len(by)} names")
-    if record.errors.nees is None:
+    sizes = _sizes(record)
+    if sizes is None:
         raise InputError(f"by: {record.name} {NO_TRUTH}")
     ((name, values),) = by.items()
     try:
-        cells = on_steps(values, record.errors.nees.shape)
+        cells = on_steps(values, sizes.shape)
     except ValueError as wrong:
         raise InputError(f"by: {wrong}") from None
     return _by_cells(record, name, cells, Reading(bins=bins), "by")

@@ -49,6 +49,7 @@ OF_BAGS = ("topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
 OF_TABLES = ("dof", "members")
 OF_NAMES = ("columns", "truth_columns")
+OF_BOUNDS = ("level", "gaussian", "ends")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 ARCHIVE_KEYS = {
@@ -126,7 +127,8 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    if path.suffix.lower() in TABLES and (r.state is not None or not is_spatial(path, r.columns)):
+    named = r.state is not None or r.level is not None
+    if path.suffix.lower() in TABLES and (named or not is_spatial(path, r.columns)):
         return True
     return is_plane(path, r.columns)
 
@@ -137,13 +139,13 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES), _bags),
+    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES, *OF_BOUNDS), _bags),
     Kind(
         _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive
     ),
     Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state", *OF_TABLES), _trajectories),
+    Kind(_is_trajectory, (*OF_BAGS, *OF_BOUNDS, "state", *OF_TABLES), _trajectories),
 )
 
 
@@ -420,6 +422,10 @@ def checked_options(r: Reading) -> Reading:
         )
     if r.ensemble is not None and r.given(OF_TRUTH):
         raise InputError(f"--ensemble: does not go with {flag_of(r.given(OF_TRUTH)[0])}, of a Gaussian error")
+    if r.given(OF_BOUNDS):
+        from consistency.referee.readers.formats.bounds import require_bound_options
+
+        require_bound_options(r)
     for name in ("by_file", "bins"):
         if r.given([name]) and r.by is None:
             raise InputError(f"{flag_of(name)}: goes with --by COLUMN")

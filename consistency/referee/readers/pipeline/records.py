@@ -68,12 +68,21 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
         e = _without_cross_terms(e, judged, r.ensemble)
     if r.by is None:
         records, _ = _records(e, judged, r)
-        return records
+        return _with_bounds(records, e, r)
     from consistency.referee.readers.pipeline.by_column import in_groups, with_values
 
     e, column = with_values(e, r, judged)
     records, pairs = _records(e, judged, r)
-    return in_groups(records, column, e, pairs, r)
+    return _with_bounds(in_groups(records, column, e, pairs, r), e, r)
+
+
+def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record]:
+    """The records with bounds in place of covariances, where bounds are stated."""
+    if e.bounds is None:
+        return records
+    from consistency.referee.readers.formats.bounds import judged_bounds
+
+    return [judged_bounds(record, e, str(r.level)) for record in records]
 
 
 def with_unit_covariances(e: Estimator) -> Estimator:
@@ -163,7 +172,8 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
             judged, still = estimated_components(e, errors, judged)
             notes += [*level, *still]
     causes = [*e.causes]
-    if r.ensemble is None and runs[0].members is None and not r.repeats:
+    are_covariances = e.bounds is None or e.bounds.gaussian
+    if are_covariances and r.ensemble is None and runs[0].members is None and not r.repeats:
         causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
     if e.convention:
@@ -361,7 +371,11 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
-    path = t = None
+    path = t = ratios = None
+    if e.bounds is not None and p.bounds is not None:
+        from consistency.referee.readers.formats.bounds import ratios_of
+
+        ratios = ratios_of(e.bounds, p.bounds, error)
     width = e.position
     if width:
         true = p.truth[:, :width]
@@ -380,6 +394,7 @@ def _track(e: Estimator, p: Poses, error: Array) -> Track:
         t=t,
         truth_covariance=p.true_covariance,
         path=path,
+        bound_ratios=ratios,
     )
 
 

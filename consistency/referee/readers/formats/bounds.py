@@ -1,0 +1,328 @@
+"""Bounds, radii and intervals with the level at which they are stated: their columns, keys and options.
+
+A bound holds for the size of one component of the error, a radius for the length of several, an interval for a
+component about its estimate. ``--gaussian`` declares that they stand for the covariance of a Gaussian.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from consistency.referee.column_names import POSE
+from consistency.referee.diagnostics.records.record import Bound, Record
+from consistency.referee.diagnostics.statistics.exceedance import deviations_of, level_of
+from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.columns import plain_name, require_units
+from consistency.referee.readers.formats.sheet import TableRows
+from consistency.referee.readers.options import Reading
+from consistency.referee.readers.places import refuse
+from consistency.referee.readers.truth_matching import Bounds, Estimator
+from consistency.referee.types import Array
+
+ENDS = "independent"
+PREFIXES = ("bound_", "radius_")
+INTERVAL = ("_low", "_high")
+FORMS = "must be above 0 and below 100 %, as 95%, or 2sigma, CEP, SEP, R95; of each column bound_x=95%,bound_y=68%"
+COLUMNS = "bound_x, radius_x_y, or x_low and x_high (--columns radius_x_y=NAME says what one is called)"
+TRACE = "is the root of a trace, which has no level: give the radius of a level, as CEP or 95%"
+WORDS = {"cep": (0.5, 2), "r95": (0.95, 2), "sep": (0.5, 3)}  # level, and dimensions of the radius
+
+
+class Level(NamedTuple):
+    """A level as it is stated: a share of the steps, or a number of standard deviations."""
+
+    text: str
+    share: float | None
+    deviations: float | None = None
+    dimensions: int | None = None  # of a radius whose name says them
+
+    def of(self, dimensions: int) -> float:
+        """Share of the steps inside a bound on so many components."""
+        if self.dimensions not in (None, dimensions):
+            raise InputError(f"--level {self.text}: is a radius of {self.dimensions} components, not of {dimensions}")
+        return level_of(self.deviations, dimensions) if self.share is None else self.share  # type: ignore[arg-type]
+
+    def in_deviations(self, dimensions: int) -> float:
+        """Standard deviations of a Gaussian in a bound on so many components."""
+        if self.deviations is not None:
+            return self.deviations
+        return deviations_of(self.of(dimensions), dimensions)
+
+
+def level_of_text(given: Any) -> Level:
+    """A level of an option or argument: 95%, 0.95, 2sigma, CEP.
+
+    Raises
+    ------
+    InputError
+        It is none, or has no level.
+    """
+    text = str(given).strip()
+    word = text.lower().replace(" ", "")
+    if word in ("2drms", "drms"):
+        raise InputError(f"--level {text}: {TRACE}")
+    if word in WORDS:
+        return Level(text, *WORDS[word][:1], None, WORDS[word][1])
+    found = re.fullmatch(r"(\d+\.?\d*(?:e-?\d+)?|\.\d+)(%|sigma|)", word)
+    value = float(found[1]) / (100.0 if found[2] == "%" else 1.0) if found else 0.0
+    if found and found[2] == "sigma" and 0.0 < value < 10.0:
+        return Level(text, None, value)
+    if not found or found[2] == "sigma" or not 0.0 < value < 1.0:
+        raise InputError(f"--level {text}: {FORMS}")
+    return Level(text, value)
+
+
+class Levels:
+    """The level of each bound, one for all or by name."""
+
+    def __init__(self, given: Any) -> None:
+        pairs = given if isinstance(given, Mapping) else {}
+        if not pairs and isinstance(given, str) and "=" in given:
+            pairs = dict([*map(str.strip, each.partition("=")[::2])] for each in given.split(","))
+        self.by_name = {str(name): level_of_text(value) for name, value in pairs.items()}
+        self.every = None if pairs else level_of_text(given)
+
+    def of(self, *names: str) -> Level:
+        """The level of a bound by any of its names."""
+        if self.every is not None:
+            return self.every
+        for name in names:
+            if name in self.by_name:
+                return self.by_name[name]
+        raise InputError(f"--level: says none for {names[0]}, only for {', '.join(self.by_name)}")
+
+    def require(self, known: Sequence[str]) -> None:
+        """Refuse a level of a bound that is not there."""
+        for name in self.by_name:
+            if name not in known:
+                raise InputError(f"--level {name}: there is no such bound; there are: {', '.join(known)}")
+
+
+def require_bound_options(r: Reading) -> None:
+    """Refuse options of bounds that say nothing, or do not go together."""
+    if r.ends not in (None, ENDS):
+        raise InputError(f"--ends {r.ends}: must be '{ENDS}'")
+    for flag, value in (("--gaussian", r.gaussian), ("--ends", r.ends)):
+        if value and r.level is None:
+            raise InputError(f"{flag}: goes with --level, as --level 95%")
+    if r.gaussian and r.ends:
+        raise InputError("--ends: is for bounds; with --gaussian covariances are judged, so leave it out")
+    if r.level is not None:
+        Levels(r.level)
+    if r.level is not None and not r.gaussian:
+        others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
+        r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
+
+
+# --- tables ----------------------------------------------------------------------------------------------
+
+
+class BoundColumns(NamedTuple):
+    """Columns of a table that state one bound."""
+
+    name: str
+    components: tuple[str, ...]
+    columns: tuple[str, ...]  # one, or those of the lower and upper end
+
+
+def bound_columns(names: Sequence[str]) -> list[BoundColumns]:
+    """Bounds that the columns of a table state."""
+    found = []
+    for name in names:
+        if name.startswith(PREFIXES[0]) and len(name) > len(PREFIXES[0]):
+            found.append(BoundColumns(name, (name.removeprefix(PREFIXES[0]),), (name,)))
+        elif name.startswith(PREFIXES[1]) and len(name) > len(PREFIXES[1]):
+            found.append(BoundColumns(name, _components(name.removeprefix(PREFIXES[1]), names), (name,)))
+        elif name.endswith(INTERVAL[0]) and (high := name.removesuffix(INTERVAL[0]) + INTERVAL[1]) in names:
+            found.append(BoundColumns(f"{name}..{high}", (name.removesuffix(INTERVAL[0]),), (name, high)))
+    return found
+
+
+def _components(text: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Components that a text such as ``x_y`` joins: names of columns where such are there."""
+    for end in range(len(text), 0, -1):
+        first, rest = text[:end], text[end + 1 :]
+        is_name = first in names or f"true_{first}" in names
+        if is_name and not rest and end == len(text):
+            return (first,)
+        if is_name and text[end : end + 1] == "_" and rest:
+            return first, *_components(rest, names)
+    return tuple(text.split("_"))
+
+
+def state_of_bounds(names: Sequence[str]) -> list[str]:
+    """The state that columns of bounds name; a pose where a heading is among x, y, heading."""
+    components = list(dict.fromkeys(c for one in bound_columns(names) for c in one.components))
+    if "heading" in components and set(components) <= set(POSE):
+        return list(POSE)
+    return components
+
+
+def with_centres(sheet: TableRows) -> TableRows:
+    """The table with the middle of each interval as its estimate, where the component has no column."""
+    data = dict(sheet.data)
+    plain = {plain_name(name) for name in data}
+    for one in bound_columns(list(data)):
+        (component, *_), (low, *high) = one.components, one.columns
+        if high and component not in plain and not {f"{component}_est", f"est_{component}"} & plain:
+            data[component] = 0.5 * (sheet.numbers(low) + sheet.numbers(high[0]))
+    return replace(sheet, data=data)
+
+
+def stated_in(sheet: TableRows, axes: Sequence[str], r: Reading) -> tuple[Bounds, Array] | None:
+    """Bounds of a table, and for each row the distance to the lower and the upper end, (N, bounds, 2); or None.
+
+    Raises
+    ------
+    InputError
+        A bound is negative, the ends of an interval are not in order, or a component or level is not known.
+    """
+    found = bound_columns(list(sheet.data))
+    if not found:
+        return None
+    levels = Levels(r.level)
+    levels.require([name for one in found for name in (one.name, *one.columns)])
+    require_units([name for one in found for name in one.columns], sheet.path)
+    values = np.empty((len(sheet), len(found), 2))
+    for k, one in enumerate(found):
+        for component in one.components:
+            if component not in axes:
+                raise InputError(f"{sheet.path}: {one.name} bounds '{component}', which is not in the state "
+                                 f"{','.join(axes)}; --state names another")  # fmt: skip
+        values[:, k] = _of_interval(sheet, one) if len(one.columns) == 2 else _of_bound(sheet, one)
+    of = [levels.of(one.name, *one.columns) for one in found]
+    return _stated([(one.name, one.components) for one in found], of, axes, r), values
+
+
+def _of_bound(sheet: TableRows, one: BoundColumns) -> Array:
+    size = sheet.numbers(one.columns[0])
+    refuse(size < 0.0, sheet.place, lambda row: f"{one.name} is negative, {size[row]:g}")
+    return np.stack([size, size], axis=-1)
+
+
+def _of_interval(sheet: TableRows, one: BoundColumns) -> Array:
+    low, high = map(sheet.numbers, one.columns)
+    x = sheet.numbers(one.components[0])
+    lower, upper = one.columns
+    refuse(low > high, sheet.place, lambda row: f"{lower} {low[row]:g} is above {upper} {high[row]:g}")
+    refuse((x < low) | (x > high), sheet.place, lambda row: (
+        f"{one.components[0]} {x[row]:g} is outside {lower} {low[row]:g} and {upper} {high[row]:g}; without a column "
+        f"'{one.components[0]}' intervals grow about their middle"
+    ))  # fmt: skip
+    return np.stack([x - low, high - x], axis=-1)
+
+
+def _stated(
+    named: Sequence[tuple[str, tuple[str, ...]]], of: Sequence[Level], axes: Sequence[str], r: Reading
+) -> Bounds:
+    bounds = []
+    for (name, components), level in zip(named, of, strict=True):
+        bounds.append(Bound(name, components, level.of(len(components)), r.ends == ENDS))
+    index = tuple(tuple(map(list(axes).index, components)) for _, components in named)
+    deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, index, strict=True))
+    stated = Bounds(tuple(bounds), index, deviations, bool(r.gaussian))
+    twice = [axes[i] for i in set(sum(index, ())) if sum(index, ()).count(i) > 1]
+    if stated.gaussian and twice:
+        raise InputError(f"--gaussian: {twice[0]} has several bounds; leave all but one of them out")
+    return stated
+
+
+# --- arrays ----------------------------------------------------------------------------------------------
+
+
+def stated_in_arrays(
+    where: str, bounds: Array, axes: Sequence[str], shape: tuple[int, ...], r: Reading
+) -> tuple[Bounds, Array]:
+    """Bounds (runs, steps, n) of each component, or (runs, steps) of the length of all; (runs, steps, bounds, 2).
+
+    Raises
+    ------
+    InputError
+        Another shape, or a negative bound.
+    """
+    if r.level is None:
+        raise InputError(f"{where}bounds need their level: --level 95%, or level=0.95 in Python")
+    if bounds.shape == shape[:2]:
+        named = [(_name("radius" if len(axes) > 1 else "bound", axes), tuple(axes))]
+        bounds = bounds[..., None]
+    elif bounds.shape == shape:
+        named = [(_name("bound", [axis]), (axis,)) for axis in axes]
+    else:
+        raise InputError(f"{where}bounds has shape {bounds.shape}, needs {shape} of each component, or {shape[:2]} of "
+                         "the length of all")  # fmt: skip
+    if (bounds < 0.0).any():
+        run, step, _ = np.argwhere(bounds < 0.0)[0]
+        raise InputError(f"{where}bounds, run {run}, step {step + 1}: negative; a bound is a size")
+    levels = Levels(r.level)
+    levels.require([name for name, _ in named])
+    return _stated(named, [levels.of(name) for name, _ in named], axes, r), np.stack([bounds, bounds], axis=-1)
+
+
+def _name(kind: str, axes: Sequence[str]) -> str:
+    """radius_x_y; "radius" and bound_0 of components without names."""
+    unnamed = [axis.removeprefix("axis ") for axis in axes if axis.startswith("axis ")]
+    if len(unnamed) > 1:
+        return kind
+    return "_".join([kind, *(unnamed or axes)])
+
+
+def require_gaussian(where: str, r: Reading) -> None:
+    """Refuse a level of covariances or deviations that is not declared to be that of a Gaussian."""
+    if not r.gaussian:
+        raise InputError(f"{where}: has no bounds at --level {r.level}: columns {COLUMNS}, or the key 'bounds' of an "
+                         "archive; with --gaussian it is the level of deviations")  # fmt: skip
+
+
+def covariance_factor(r: Reading) -> float:
+    """Factor on covariances whose deviations are stated at a level."""
+    level = Levels(r.level).of("the covariance")
+    return level.in_deviations(level.dimensions or 1) ** -2
+
+
+# --- what is judged ----------------------------------------------------------------------------------------
+
+
+def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
+    """Covariances (N, n, n) of the Gaussian that bounds stand for; of radii, circular ones.
+
+    Where they do not stand for one, the matrices say which rows state a bound: NaN where one is NaN.
+    """
+    variances = np.ones((len(values), n))
+    for k, (index, deviations) in enumerate(zip(stated.index, stated.deviations, strict=True)):
+        sigma = values[:, k].mean(axis=-1) / deviations
+        if not stated.gaussian:
+            sigma = np.where(np.isnan(sigma), np.nan, 1.0)
+        variances[:, list(index)] *= np.square(sigma)[:, None]
+    return variances[:, :, None] * np.eye(n)
+
+
+def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
+    """Errors (N, n) over their bounds (N, bounds, 2), with the sign of single components, (N, bounds)."""
+    out = np.empty(values.shape[:2])
+    for k, index in enumerate(stated.index):
+        e = errors[:, index[0]] if len(index) == 1 else np.linalg.norm(errors[:, list(index)], axis=1)
+        size = np.where(e < 0.0, values[:, k, 0], values[:, k, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out[:, k] = np.where(e == 0.0, 0.0 * size, e / size)
+        out[:, k] = np.where((e == 0.0) & np.isinf(size), 0.0, out[:, k])
+    return out
+
+
+def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:
+    """The record with bounds in place of covariances; with ``--gaussian``, components by what they are stated with."""
+    stated = e.bounds
+    assert stated is not None
+    if stated.gaussian:
+        places = {list(e.axes).index(axis): i for i, axis in enumerate(record.errors.axes)}
+        parts = tuple(tuple(places[i] for i in index) for index in stated.index)
+        note = f"{e.said}: bounds are read as those of a Gaussian at --level {level_text}"
+        errors = replace(record.errors, parts=parts if len(parts) > 1 else ())
+        return replace(record, errors=errors).with_notes(note)
+    failures = tuple(replace(f, reason=f.reason.replace("covariance", "bound")) for f in record.failures)
+    errors = replace(record.errors, error=None, covariance=None, nees=None, dof=0, bounds=stated.bounds)
+    return replace(record, errors=errors, failures=failures, origin=replace(record.origin, causes=()))

@@ -37,6 +37,8 @@ from .referee.fit_covariance.drives import drive_of as drive_of
 from .referee.fit_covariance.drives import read_drives as read_drives
 from .referee.fit_covariance.noise_model import NoiseModel as NoiseModel
 from .referee.fit_covariance.noise_model import fit_covariance as fit_covariance
+from .referee.notebook.read_and_judge import inspect as inspect
 from .referee.notebook.read_and_judge import judge as judge
 from .referee.notebook.read_and_judge import read as read
 from .referee.programs.study import monte_carlo as monte_carlo
+from .referee.verdicts.inspect_sources import Inspection as Inspection

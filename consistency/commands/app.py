@@ -215,6 +215,7 @@ ROWS = (
         "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
         "analyse est --truth truth --align posyaw",
         "analyse results --skip 2s --fail-on inconsistent"),
+    Row("inspect", "judging:inspect_command", "", "inspect est.csv", "inspect bags --topic /odometry/filtered"),
     Row("report", "judging:report_command", "report",
         "report est.txt --truth truth.txt --covariance P.txt",
         "report results"),

@@ -119,7 +119,12 @@ def analyse_command(
 
         overwrite = require_report(report, overwrite)
     if are_files(path, files):
-        recordings = [recording.without_first(first) for recording in read_files(path, files)]
+        try:
+            recordings = [recording.without_first(first) for recording in read_files(path, files)]
+        except InputError as error:
+            from consistency.referee.verdicts.inspect_sources import says_more
+
+            raise InputError(f"{error}; see: consistency inspect {path}") if says_more(path, files) else error from None
         source = files_source(path, recordings)
         verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
@@ -163,6 +168,21 @@ def analyse_command(
         print(f"consistency: {refused}", file=sys.stderr)
     if is_failed:
         raise typer.Exit(1)
+
+
+@reads_files
+def inspect_command(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help=f"File or folder: {ESTIMATES}, flight logs.")],
+    files: Reading,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a file holds, and the command that judges it."""
+    from consistency.referee.verdicts.inspect_sources import inspect, inspection_document
+
+    found = inspect(path, files)
+    print_document(inspection_document(found), as_json)
+    if found.missing:
+        raise InputError(f"{path}: nothing judges it as it is, see above")
 
 
 def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:

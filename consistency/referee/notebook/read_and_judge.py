@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import escape
 from pathlib import Path
 from typing import Any, cast
@@ -24,7 +24,11 @@ from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
+from consistency.referee.verdicts.inspect_sources import Inspection
+from consistency.referee.verdicts.inspect_sources import inspect as inspect_file
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
+
+OF_PATHS = ("truth", "covariance", "by_file")  # options that are paths
 
 
 def read(
@@ -128,6 +132,31 @@ def read(
     if name not in named:
         raise InputError(f"filter '{name}' is not in {where}; there are: {', '.join(named)}")
     return named[name]
+
+
+def inspect(path: str | Path, **options: Any) -> Inspection:
+    """Inspect a file: what it holds, and what judges it.
+
+    Parameters
+    ----------
+    path : file or folder of estimates, a bag, a flight log
+    options : of :func:`read`, as far as they are known; others are looked for
+
+    Returns
+    -------
+    Inspection
+        ``print`` shows it. ``command`` is the command line, and ``cs.read(path, **arguments)`` reads what it judges.
+
+    Raises
+    ------
+    InputError
+        There is no such file, its kind is unknown, or there is no such option.
+    """
+    for name in options:
+        if name not in (there := [each.name for each in fields(Reading)]):
+            raise InputError(f"{name}: is no option of files; there are: {', '.join(there)}")
+    given = {name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()}
+    return inspect_file(Path(path), Reading(**given))
 
 
 def judge(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -163,6 +163,37 @@ def _other_frames(bag: Path, estimates: tuple[str, Frames], truth: tuple[str, Fr
 
 
 # --- topics -----------------------------------------------------------------------------------------
+
+
+class Topic(NamedTuple):
+    """A topic of a bag."""
+
+    name: str
+    kind: str
+    messages: int
+    text: str  # its kind, messages, rate and frames
+
+
+def topics_of(path: Path) -> list[Topic]:
+    """The topics of a bag by name; of a folder of bags those of its first one.
+
+    Raises
+    ------
+    InputError
+        It cannot be read.
+    """
+    bag = path if is_one_bag(path) else min(filter(is_one_bag, path.iterdir()))
+    found = []
+    with _opened(bag) as reader:
+        seconds = SECOND * reader.duration
+        for name, topic in sorted(reader.topics.items()):
+            text = f"{name}  {topic.msgtype}, {topic.msgcount} messages"
+            if topic.msgcount > 1 and seconds > 0:
+                text += f", {topic.msgcount / seconds:.3g} Hz"
+            if topic.msgtype in POSES:
+                text += f", frames {' and '.join(filter(None, _frames(reader, name))) or 'without names'}"
+            found.append(Topic(name, topic.msgtype or "", topic.msgcount, text))
+    return found
 
 
 @contextmanager

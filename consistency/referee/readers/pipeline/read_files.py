@@ -70,6 +70,7 @@ def is_program_runs(path: Path) -> bool:
 class Kind(NamedTuple):
     """A kind of files; its reader gives estimators, or records where a file holds no poses and no errors."""
 
+    name: str
     is_one: Callable[[Path, Reading], bool]
     refused: tuple[str, ...]  # options
     read: Callable[[Path, Reading, bool], Found]  # path, options, poses alone: covariances are not looked at
@@ -130,12 +131,12 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 
 KINDS = (  # a file is of the first that knows it
-    Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
-    Kind(_is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
-    Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
-    Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
+    Kind("runs of a program", lambda path, r: is_program_runs(path), (), _program_runs),
+    Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
+    Kind("archive of arrays", _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind("table", _is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
+    Kind("folder of tables", _is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
+    Kind("trajectory", _is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),
 )
 
 

@@ -182,7 +182,7 @@ def inspect_command(
     found = inspect(path, files)
     print_document(inspection_document(found), as_json)
     if found.missing:
-        raise InputError(f"{path}: nothing judges it as it is, see above")
+        raise InputError(found.missing)
 
 
 def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:

@@ -23,6 +23,7 @@ VERBS = [
     "Measure",
     "Re-run",
     "Run",
+    "Show",
     "Simulate",
     "Store",
     "Watch",

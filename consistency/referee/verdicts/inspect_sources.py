@@ -233,9 +233,6 @@ def _beside(path: Path, words: re.Pattern[str]) -> list[Path]:
     near = [other for other in near if words.search(other.stem)]
     if words is TRUTH:
         near += filter(file_kinds.is_drive, path.parent.iterdir())
-    if not path.is_dir():
-        folders = (other for other in path.resolve().parent.parent.iterdir() if words.search(other.name))
-        near += [folder / path.name for folder in folders if (folder / path.name).is_file()]
     near = [other for other in near if other.is_dir() or other.suffix.lower() in file_kinds.SUFFIXES]
 
     def alike(other: Path) -> int:

@@ -50,6 +50,7 @@ OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # 
 OF_NAMES = ("columns", "truth_columns")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
+OF_OTHERS_THAN_ARCHIVES = (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES)
 ARCHIVE_KEYS = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances"}  # in place of options
 PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
 Found = Sequence[Estimator | Record]
@@ -133,7 +134,7 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 KINDS = (  # a file is of the first that knows it
     Kind("runs of a program", lambda path, r: is_program_runs(path), (), _program_runs),
     Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, "dof"), _bags),
-    Kind("archive of arrays", _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", "dof", *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive),
+    Kind("archive of arrays", _is_archive, OF_OTHERS_THAN_ARCHIVES, _archive),
     Kind("table", _is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind("folder of tables", _is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
     Kind("trajectory", _is_trajectory, (*OF_BAGS, "state", "dof"), _trajectories),

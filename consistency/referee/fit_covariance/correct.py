@@ -452,7 +452,7 @@ def correction_lines(found: Correction) -> Iterator[str]:
     gain = found.gain
     ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
     yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
-    if len(found.fitted) < FEW and np.isfinite(found.excess):
+    if len(found.fitted) < FEW and np.isfinite(found.excess) and f"{found.excess:.3g}" != "1":
         without = found.after.ratio.value / found.excess
         yield (
             f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "

@@ -38,6 +38,7 @@ from consistency.referee.fit_covariance.factors import (
     steps_of_runs,
 )
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
 
@@ -184,12 +185,16 @@ def correct(
     counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
     blocks = blocks_of(record.axes, record.dof, per_axis)
-    fits = fit_groups(record.of_runs(fitted), blocks)
-    place = {run: row for row, run in enumerate(fitted)}
-    used = tuple(by_group(fits, place.get(run)) for run in judged)
-    some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
-    before = held_out_by(some)
-    after = held_out_by(with_factors(some, used))
+    with progress("correction", 3, "parts", brief=True) as advance:
+        fits = fit_groups(record.of_runs(fitted), blocks)
+        advance(1)
+        place = {run: row for row, run in enumerate(fitted)}
+        used = tuple(by_group(fits, place.get(run)) for run in judged)
+        some = replace(record, map=None, rejections=None, world=None).of_runs(judged)
+        before = held_out_by(some)
+        advance(1)
+        after = held_out_by(with_factors(some, used))
+        advance(1)
     dof = np.array([fit.dof for fit in fits.values()])
     return Correction(
         name=record.name,

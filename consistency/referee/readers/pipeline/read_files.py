@@ -31,13 +31,13 @@ from consistency.referee.readers.formats.file_kinds import (
     trajectory_files,
     unknown_kind,
 )
+from consistency.referee.readers.options import MODES as ALIGNMENTS
 from consistency.referee.readers.options import OF_AXES, Reading, flag_of
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
-ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 IN_COLUMNS = ("so2", "so3", "so3-body", "vector", *CHARTS)  # differences of columns of positions and velocities
 GUESS = "guess"  # judge every convention
 NO_GUESS = {

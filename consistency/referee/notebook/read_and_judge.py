@@ -16,8 +16,8 @@ from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
-from consistency.referee.document.tables import summary
-from consistency.referee.errors import InputError
+from consistency.referee.document.tables import document, summary
+from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
@@ -31,6 +31,7 @@ from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 OF_PATHS = ("truth", "covariance", "by_file")  # options that are paths
 
 
+@naming_arguments
 def read(
     estimates: str | Path | Any,
     truth: str | Path | Any | None = None,
@@ -134,6 +135,7 @@ def read(
     return named[name]
 
 
+@naming_arguments
 def inspect(path: str | Path, **options: Any) -> Inspection:
     """Inspect a file: what it holds, and what judges it.
 
@@ -159,6 +161,7 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
     return inspect_file(Path(path), Reading(**given))
 
 
+@naming_arguments
 def judge(
     record: Record | str | Path | ArrayLike,
     covariances: ArrayLike | None = None,
@@ -259,11 +262,37 @@ def verdict_html(verdict: Verdict) -> str:
     return as_html.fragment(*blocks)
 
 
-def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
-    """See :meth:`Record.plot`."""
-    from consistency.referee.pages.record_figures import overview
+def plot(record: Record, verdict: Verdict | None, path: str | Path | None, figure: str | None = None) -> Any:
+    """See :meth:`Record.plot` and :meth:`Verdict.plot`."""
+    from consistency.referee.pages.record_figures import overview, record_figures
     from consistency.referee.pages.write_pages import plotted
 
     if record.error is not None and not record.axes:
         record = replace(record, axes=numbered_axes(record.error.shape[-1]))
-    return plotted(overview(record, verdict), path)
+    if figure is None or verdict is None:
+        return plotted(overview(record, verdict), path)
+    of_report = {each.title: each.drawings for each in record_figures(record, verdict)}
+    if figure not in of_report:
+        raise InputError(f"figure={figure!r}: is not in the report; there are: {', '.join(of_report)}")
+    return plotted(of_report[figure][0], path)
+
+
+def write_verdict(verdict: Verdict, path: str | Path, overwrite: bool) -> list[Path]:
+    """See :meth:`Verdict.write`."""
+    from consistency.referee.pages.write_pages import (
+        is_one_file,
+        require_report,
+        write_file_reports,
+        write_text_file,
+    )
+    from consistency.referee.show.as_json import render
+
+    path = Path(path)
+    replaces = require_report(path, overwrite)
+    shown = document({verdict.filter: verdict}, path.name)
+    if is_one_file(path):
+        return [write_text_file(shown, path)]
+    if verdict.record is None:
+        raise InputError(f"{verdict.filter}: the record was not kept with the verdict; write FILE.xml or FILE.md")
+    judged = {verdict.filter: verdict}
+    return write_file_reports([verdict.record], judged, path, verdict.filter, render(document(judged)), replaces)

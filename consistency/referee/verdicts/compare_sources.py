@@ -44,6 +44,9 @@ class Compared:
     same_runs: bool = True  # failures are of the same trials
     sources: tuple[str, str] = ("", "")  # files or folders of both, where they differ
 
+    def __str__(self) -> str:
+        return self.sentence
+
     @property
     def sentence(self) -> str:
         c = self.comparison

@@ -7,6 +7,7 @@ from typing import Any
 # fast, and the core works without the packages of the bench. __init__.pyi has the same names for type checkers.
 _MODULES = {
     "Alarm": "referee.diagnostics.monitor",
+    "Compared": "referee.verdicts.compare_sources",
     "Control": "bench.types",
     "Correction": "referee.fit_covariance.correct",
     "Drive": "referee.fit_covariance.drives",
@@ -14,6 +15,7 @@ _MODULES = {
     "Gaussian": "bench.types",
     "Info": "bench.types",
     "InputError": "referee.errors",
+    "Inspection": "referee.verdicts.inspect_sources",
     "Log": "bench.store.recorded_log",
     "Monitor": "referee.diagnostics.monitor",
     "NoiseModel": "referee.fit_covariance.noise_model",
@@ -28,17 +30,20 @@ _MODULES = {
     "analyse": "bench.runs.results_to_records",
     "anees": "referee.diagnostics.statistics.nees",
     "anees_interval": "referee.diagnostics.statistics.nees",
-    "correct": "referee.fit_covariance.correct",
+    "compare": "referee.notebook.plan_and_compare",
+    "correct": "referee.fit_covariance.in_python",
     "drive_of": "referee.fit_covariance.drives",
     "filter_names": "bench.filters",
-    "fit_covariance": "referee.fit_covariance.noise_model",
+    "fit_covariance": "referee.fit_covariance.in_python",
     "get_filter": "bench.filters",
     "guarded": "bench.filters.compiled",
+    "inspect": "referee.notebook.read_and_judge",
     "judge": "referee.notebook.read_and_judge",
     "load_scenario": "bench.scenario",
     "make_record": "referee.diagnostics.records.record",
     "monte_carlo": "referee.programs.study",
     "nees": "referee.diagnostics.statistics.nees",
+    "plan": "referee.notebook.plan_and_compare",
     "read": "referee.notebook.read_and_judge",
     "read_drives": "referee.fit_covariance.drives",
     "read_log": "bench.store.recorded_log",
@@ -47,6 +52,7 @@ _MODULES = {
     "scenario_names": "bench.scenario",
     "simulate": "bench.simulation",
     "tune": "bench.tuning.tune",
+    "verdict_table": "referee.notebook.plan_and_compare",
 }
 
 

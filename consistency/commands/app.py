@@ -24,22 +24,36 @@ from consistency.referee.extras import explained, is_installed, remedy, require
 UsageError: Any = typer.BadParameter.__base__  # click's, wherever typer keeps it
 Abort: Any = typer.Abort
 HELP = ["-h", "--help"]
+HELP_ALL = "--help-all"
 GROUPS = {  # of the list of commands; a command that stands in none is in the first
     "Judge your own estimator": (),
     "The stereo SLAM test bench": ("list", "simulate", "run", "reproduce", "sweep", "challenge", "tune"),
     "Stereo images": ("frontend", "characterise"),
 }
-PANELS = {  # of the options of commands that read files; an option that stands in none is in the last
+PANELS = {  # of the options of commands that read files
     "Needed first": (
         "truth", "covariance", "error", "state", "align", "relative", "skip", "false_alarm", "report", "fail_on",
+        "span", "estimates", "out",
     ),
     "What to read": (
-        "covariance_order", "axes", "topic", "truth_topic", "body", "truth_covariance", "truth_errors", "truth_shared",
-        "filters", "split", "motions", "dof",
+        "topic", "truth_topic", "columns", "truth_columns", "world", "body_axes", "truth_world", "truth_body_axes",
+        "filters", "name", "axes", "covariance_order", "body", "truth_covariance", "truth_errors", "truth_shared",
+        "split", "motions", "dof", "second",
     ),
     "How to align": ("max_dt", "time_offset", "lever_arm", "windows"),
-    "What to ask": ("detect", "tolerance", "lost", "innovations", "confidence", "by"),
-    "What to write": (),
+    "What to run": (
+        "each", "runs", "until_decided", "max_runs", "seed", "jobs", "timeout", "cwd", "check_seed", "keep", "resume",
+    ),
+    "What to fit": ("per", "held_out", "keep_mean_error", "no_correct", "by_turn", "cautious", "anyway"),
+    "What to ask": (
+        "by", "by_file", "bins", "detect", "tolerance", "lost", "innovations", "confidence", "power",
+    ),
+    "What to write": ("html", "pdf", "junit", "verbose", "as_json", "overwrite", "help"),
+}  # fmt: skip
+SELDOM = {  # options that --help-all alone shows
+    "covariance_order", "body", "truth_covariance", "truth_errors", "truth_shared", "motions", "windows", "dof",
+    "lever_arm", "truth_columns", "body_axes", "truth_world", "truth_body_axes", "bins", "by_file", "tolerance", "lost",
+    "confidence", "verbose", "max_dt",
 }  # fmt: skip
 
 
@@ -154,12 +168,14 @@ def _show_help(arguments: list[str] | None) -> bool:
     Typer does so after it has imported what checks the values of options, which takes longer than all the rest.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    if len(words) != 2 or words[1] not in HELP:
+    is_all = HELP_ALL in words[1:]
+    if not is_all and (len(words) != 2 or words[1] not in HELP):
         return False
     root: Any = typer.main.get_command(app)
     top: Any = typer.Context(root, info_name="consistency", help_option_names=HELP)
     command = root.get_command(top, words[0])
     if command is not None:
+        command.shows_all = is_all
         print(command.get_help(typer.Context(command, info_name=words[0], parent=top)))
     return command is not None
 
@@ -215,6 +231,7 @@ ROWS = (
         "analyse est.txt --truth truth.txt --covariance P.txt --error so3",
         "analyse est --truth truth --align posyaw",
         "analyse results --skip 2s --fail-on inconsistent"),
+    Row("inspect", "judging:inspect_command", "", "inspect est.csv", "inspect bags --topic /odometry/filtered"),
     Row("report", "judging:report_command", "report",
         "report est.txt --truth truth.txt --covariance P.txt",
         "report results"),
@@ -272,6 +289,7 @@ class MarkedCommand(TyperCommand):
     """A command that says in the list of commands which of its extras are not installed."""
 
     lacks: tuple[str, ...] = ()
+    shows_all: bool = False  # options that few need, too
 
     def get_short_help_str(self, limit: int = 45) -> str:
         mark = f"[{','.join(self.lacks)}] " if self.lacks else ""
@@ -279,17 +297,20 @@ class MarkedCommand(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """The options of a command that reads files in panels, and those of others in one list."""
-        names = [parameter.name for parameter in self.get_params(ctx)]
-        if "truth_covariance" not in names:
+        names = {parameter.name for parameter in self.get_params(ctx)}
+        if "truth_world" not in names:
             super().format_options(ctx, formatter)
             return
+        hidden = SELDOM.intersection(names) if not self.shows_all else set()
         records: dict[str, list[tuple[str, str]]] = {"Arguments": [], **{panel: [] for panel in PANELS}}
         for panel, parameter in in_panels(self.get_params(ctx)):
-            if (record := parameter.get_help_record(ctx)) is not None:
+            if parameter.name not in hidden and (record := parameter.get_help_record(ctx)) is not None:
                 records[panel].append(record)
         for panel in filter(records.get, records):
             with formatter.section(panel):
                 formatter.write_dl(records[panel])
+        if hidden:
+            formatter.write(f"\n  {len(hidden)} more options, seldom needed: consistency {ctx.info_name} {HELP_ALL}\n")
 
 
 def in_panels(parameters: Iterable[Any]) -> list[tuple[str, Any]]:

@@ -16,7 +16,9 @@ import typer
 from consistency.commands.shared_options import (
     DETECT_HELP,
     ESTIMATES,
+    FILTER_NAMES,
     LOST_HELP,
+    SCENARIO_NAMES,
     AsJson,
     FalseAlarm,
     Judged,
@@ -56,7 +58,7 @@ def analyse_command(
     ] = None,
     false_alarm: Annotated[
         float | None,
-        typer.Option("--false-alarm", help=f"Probability of finding a fault in a correct filter [{FALSE_ALARM}]."),
+        typer.Option("--false-alarm", help=f"Probability of rejecting a correct filter [{FALSE_ALARM}]."),
     ] = None,
     detect: Annotated[
         float | None,
@@ -87,14 +89,14 @@ def analyse_command(
     skip: Skip = None,
     report: Annotated[
         Path | None,
-        typer.Option("--report", help="Folder for an HTML and a PDF page, or FILE.xml (JUnit), or FILE.md."),
+        typer.Option("--report", help="Folder for HTML and PDF; or FILE.xml (JUnit), .md."),
     ] = None,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Show p values of all questions and credibility indices, too.")
     ] = False,
     as_json: AsJson = False,
     fail_on: Annotated[
-        str | None, typer.Option("--fail-on", help="'inconsistent': exit with status 1 unless all are consistent.")
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless all are consistent.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files other than reports, too.")] = False,
 ) -> None:
@@ -119,7 +121,12 @@ def analyse_command(
 
         overwrite = require_report(report, overwrite)
     if are_files(path, files):
-        recordings = [recording.without_first(first) for recording in read_files(path, files)]
+        try:
+            recordings = [recording.without_first(first) for recording in read_files(path, files)]
+        except InputError as error:
+            from consistency.referee.verdicts.inspect_sources import says_more
+
+            raise InputError(f"{error}; see: consistency inspect {path}") if says_more(path, files) else error from None
         source = files_source(path, recordings)
         verdicts = judge_all(source, filters, settings=settings, optimal_gain=innovations is not None)
         tell_notes(recordings)
@@ -163,6 +170,21 @@ def analyse_command(
         print(f"consistency: {refused}", file=sys.stderr)
     if is_failed:
         raise typer.Exit(1)
+
+
+@reads_files
+def inspect_command(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help=f"File or folder: {ESTIMATES}, flight logs.")],
+    files: Reading,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a file holds, and the command that judges it."""
+    from consistency.referee.verdicts.inspect_sources import inspect, inspection_document
+
+    found = inspect(path, files)
+    print_document(inspection_document(found), as_json)
+    if found.missing:
+        raise InputError(found.missing)
 
 
 def _refuse_unfinished(path: Path, source: Source, command: str, fail_on: str | None) -> None:
@@ -214,11 +236,16 @@ def plan_command(
     scenario: Annotated[
         str | None,
         typer.Argument(
-            metavar="[SCENARIO]", help="Scenario of a short pilot, which shows how steps depend on each other."
+            metavar="[SCENARIO]",
+            help="Scenario of a short pilot, which shows how steps depend on each other.",
+            autocompletion=SCENARIO_NAMES,
         ),
     ] = None,
     filters: Annotated[
-        list[str] | None, typer.Option("--filter", metavar="NAME", help="Filter of the pilot; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            "--filter", metavar="NAME", help="Filter of the pilot; may be repeated.", autocompletion=FILTER_NAMES
+        ),
     ] = None,
     like: Annotated[
         Path | None, typer.Option("--like", metavar="RESULTS", help="Results to use instead of a pilot.")
@@ -427,9 +454,17 @@ def monitor_command(
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.flight_logs import STATED, is_dataflash
     from consistency.referee.verdicts.judge_sources import skip_asked
-    from consistency.referee.verdicts.monitor_sources import make_monitor, watch, watch_lines, without_first
+    from consistency.referee.verdicts.monitor_sources import (
+        make_monitor,
+        refuse_bags,
+        watch,
+        watch_lines,
+        without_first,
+    )
 
     require_word("--fail-on", fail_on, "alarm")
+    if path != "-":
+        refuse_bags(Path(path))
     first = skip_asked(skip)
     if is_dataflash(Path(path)) and filter_name not in STATED:
         if refused := given_options(fail_on=fail_on, gate=gate, mission=mission, skip=skip):

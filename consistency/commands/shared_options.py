@@ -19,6 +19,25 @@ if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
     from consistency.referee.document.blocks import Document
 
+
+def completed(values: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """A completion of values in the shell, which are looked up when they are asked for."""
+    return lambda incomplete: [value for value in values() if value.startswith(incomplete)]
+
+
+def _filters() -> Iterable[str]:
+    from consistency.bench.filters import filter_names
+
+    return filter_names()
+
+
+def _scenarios() -> Iterable[str]:
+    from consistency.bench.scenario import scenario_names
+
+    return scenario_names()
+
+
+FILTER_NAMES, SCENARIO_NAMES = completed(_filters), completed(_scenarios)
 Out = Annotated[Path, typer.Option("--out", help="Output folder; must not exist.")]
 Runs = Annotated[int, typer.Option("--runs", help="Number of Monte Carlo runs.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the noise.")]
@@ -52,7 +71,7 @@ SlurmOptions = Annotated[
 LOST_HELP = "share of lost runs that must be excluded"
 Skip = Annotated[
     str | None,
-    typer.Option("--skip", metavar="N|Ns", help="Leave out the first N steps, or seconds (2s), of each run."),
+    typer.Option("--skip", metavar="N|Ns", help="Leave out the first N steps, or seconds, of each run."),
 ]
 DETECT_HELP = "ratio of true to stated covariance that must be found"
 SCENARIO = "Built-in name (see 'list') or path to a .toml file."
@@ -164,7 +183,9 @@ def reads_files(
 def _parameter(of: Field[Any], kind: Any) -> inspect.Parameter:
     """An option of files as typer takes it; what is parsed comes as text."""
     m = of.metadata
-    option = typer.Option(m["flag"] or flag_of(of.name), help=m["help"], metavar=m["metavar"], show_default=False)
+    completion = completed(lambda: m["values"]) if m["values"] else None
+    flag = m["flag"] or flag_of(of.name)
+    option = typer.Option(flag, help=m["help"], metavar=m["metavar"], show_default=False, autocompletion=completion)
     typed = str | None if m["parse"] else kind
     annotation = Annotated[typed, option]  # type: ignore[valid-type]
     return inspect.Parameter(of.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

@@ -14,8 +14,10 @@ import typer
 
 from consistency.commands.shared_options import (
     DETECT_HELP,
+    FILTER_NAMES,
     LOST_HELP,
     SCENARIO,
+    SCENARIO_NAMES,
     AsJson,
     BackendName,
     FalseAlarm,
@@ -37,7 +39,7 @@ from consistency.referee.extras import missing, remedy
 
 
 def simulate_command(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=SCENARIO)],
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help=SCENARIO, autocompletion=SCENARIO_NAMES)],
     out: Out,
     runs: Runs = 1,
     seed: Seed = 0,
@@ -58,9 +60,16 @@ def run_command(
     out: Out,
     filters: Annotated[
         list[str],
-        typer.Option("--filter", metavar="NAME", help="Filter (see 'list'), or FILTER+gate; may be repeated."),
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="Filter (see 'list'), or FILTER+gate; may be repeated.",
+            autocompletion=FILTER_NAMES,
+        ),
     ],
-    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO, autocompletion=SCENARIO_NAMES)
+    ] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Folder of a recorded log, instead of a scenario.")] = None,
     screen: Annotated[
         str | None,
@@ -187,9 +196,11 @@ def reproduce_command(
         print(path)
     missed = [finding for finding in findings if finding.verdict != "reproduced"]
     for word in ("not reproduced", "refuted", "not shown"):
-        names = [finding.id for finding in missed if outcome(finding.source, finding.verdict) == word]
-        if names:
-            print(f"{word}: {', '.join(names)}", file=sys.stderr)
+        said = [finding for finding in missed if outcome(finding.source, finding.verdict) == word]
+        if said:
+            are_ours = word == "refuted" and all(finding.source.startswith(OURS) for finding in said)
+            may = " (conjectures of this project, which may be refuted: no failure)" if are_ours else ""
+            print(f"{word}: {', '.join(finding.id for finding in said)}{may}", file=sys.stderr)
     if not all(finding.source.startswith(OURS) or finding.verdict == NOT_SHOWN for finding in missed):
         raise typer.Exit(1)
 
@@ -206,7 +217,12 @@ def sweep_command(
     ] = None,
     filters: Annotated[
         list[str] | None,
-        typer.Option("--filter", metavar="NAME", help="Filter, instead of those in the file; may be repeated."),
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="Filter, instead of those in the file; may be repeated.",
+            autocompletion=FILTER_NAMES,
+        ),
     ] = None,
     jobs: Jobs = -1,
     backend: BackendName = "local",
@@ -244,8 +260,12 @@ def sweep_command(
 
 
 def tune_command(
-    filter_name: Annotated[str, typer.Option("--filter", help="Filter name (see 'list').")],
-    scenario: Annotated[str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO)] = None,
+    filter_name: Annotated[
+        str, typer.Option("--filter", help="Filter name (see 'list').", autocompletion=FILTER_NAMES)
+    ],
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help=SCENARIO, autocompletion=SCENARIO_NAMES)
+    ] = None,
     log: Annotated[Path | None, typer.Option("--log", help="Folder of a recorded log, instead of a scenario.")] = None,
     groups: Annotated[
         str,
@@ -311,10 +331,16 @@ def tune_command(
 
 
 def challenge_command(
-    filter_name: Annotated[str, typer.Argument(metavar="FILTER", help="Built-in filter (see 'list').")],
+    filter_name: Annotated[
+        str, typer.Argument(metavar="FILTER", help="Built-in filter (see 'list').", autocompletion=FILTER_NAMES)
+    ],
     scenario: Annotated[
         str | None,
-        typer.Option("--scenario", help="World to start from: built-in name or .toml [one that fits the filter]."),
+        typer.Option(
+            "--scenario",
+            help="World to start from: built-in name or .toml [one that fits the filter].",
+            autocompletion=SCENARIO_NAMES,
+        ),
     ] = None,
     within: Annotated[
         list[str] | None,

@@ -51,3 +51,9 @@ def test_a_python_without_venv_is_told_in_one_line(checkout):
     assert "apt install python3-venv" in done.stderr.splitlines()[0]
     assert "-m venv" not in done.stdout
     assert not (checkout / ".venv").exists()
+
+
+def test_what_the_first_commands_of_the_readme_write_is_ignored_by_git():
+    """The files of the example, the report, and what its pages name."""
+    ignored = (ROOT / ".gitignore").read_text("utf-8").splitlines()
+    assert {"/estimates.csv", "/truth.csv", "/look/"} <= set(ignored)

@@ -173,7 +173,7 @@ def _count_sentence(studies: Sequence[Study], tracks: Sequence[Track]) -> str:
         return f"{unknown[:1].upper()}{unknown[1:]}."
     statuses = Counter(track.verdict.status for track in tracks)
     counts = [f"{statuses[status]} {status}" for status in STATUSES if statuses[status]]
-    return f"In {len(studies)} worlds, of {len(tracks)} verdicts on a filter {names_in_a_row(counts)}."
+    return f"{plural(len(tracks), 'verdict')} in {len(studies)} worlds: {', '.join(counts)}."
 
 
 def _status_sentence(status: str, pairs: list[tuple[Track, Study]]) -> str:

@@ -241,6 +241,7 @@ class Document:
     chapters: tuple[Chapter, ...]
     opening: tuple[Block, ...] = ()  # below the answer, before the contents
     data: Any = None  # the same for programs: names, numbers, texts, arrays and verdicts
+    command: str = ""  # by which it is written
 
     @property
     def parts(self) -> tuple[tuple[Block, ...], ...]:

@@ -39,6 +39,7 @@ from consistency.referee.fit_covariance.factors import (
     steps_of_runs,
 )
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
 
@@ -192,12 +193,16 @@ def correct(
     counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
     blocks = blocks_of(record.errors.axes, record.errors.dof, per_axis or record.errors.assumed)
-    fits = fit_groups(record.of_runs(fitted), blocks)
-    place = {run: row for row, run in enumerate(fitted)}
-    used = tuple(by_group(fits, place.get(run)) for run in judged)
-    some = replace(record, map=Map(), world=None).of_runs(judged)
-    before = held_out_by(some)
-    after = held_out_by(with_factors(some, used))
+    with progress("correction", 3, "parts", brief=True) as advance:
+        fits = fit_groups(record.of_runs(fitted), blocks)
+        advance(1)
+        place = {run: row for row, run in enumerate(fitted)}
+        used = tuple(by_group(fits, place.get(run)) for run in judged)
+        some = replace(record, map=Map(), world=None).of_runs(judged)
+        before = held_out_by(some)
+        advance(1)
+        after = held_out_by(with_factors(some, used))
+        advance(1)
     dof = np.array([fit.dof for fit in fits.values()])
     return Correction(
         name=record.name,
@@ -472,7 +477,7 @@ def correction_lines(found: Correction) -> Iterator[str]:
     ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
     if not found.assumed:
         yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
-    if len(found.fitted) < FEW and np.isfinite(found.excess):
+    if len(found.fitted) < FEW and np.isfinite(found.excess) and f"{found.excess:.3g}" != "1":
         without = found.after.ratio.value / found.excess
         yield (
             f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "

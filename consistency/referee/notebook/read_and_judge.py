@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import escape
 from pathlib import Path
 from typing import Any, cast
@@ -16,8 +16,8 @@ from consistency.referee.diagnostics.records.record import Record, numbered_axes
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
-from consistency.referee.document.tables import summary
-from consistency.referee.errors import InputError
+from consistency.referee.document.tables import document, summary
+from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.formats.archives import UNWEIGHTED
 from consistency.referee.readers.options import REPEATS, Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
@@ -25,9 +25,14 @@ from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
+from consistency.referee.verdicts.inspect_sources import Inspection
+from consistency.referee.verdicts.inspect_sources import inspect as inspect_file
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
+OF_PATHS = ("truth", "covariance", "by_file")  # options that are paths
 
+
+@naming_arguments
 def read(
     estimates: str | Path | Any,
     truth: str | Path | Any | None = None,
@@ -147,6 +152,33 @@ def read(
     return named[name]
 
 
+@naming_arguments
+def inspect(path: str | Path, **options: Any) -> Inspection:
+    """Inspect a file: what it holds, and what judges it.
+
+    Parameters
+    ----------
+    path : file or folder of estimates, a bag, a flight log
+    options : of :func:`read`, as far as they are known; others are looked for
+
+    Returns
+    -------
+    Inspection
+        ``print`` shows it. ``command`` is the command line, and ``cs.read(path, **arguments)`` reads what it judges.
+
+    Raises
+    ------
+    InputError
+        There is no such file, its kind is unknown, or there is no such option.
+    """
+    for name in options:
+        if name not in (there := [each.name for each in fields(Reading)]):
+            raise InputError(f"{name}: is no option of files; there are: {', '.join(there)}")
+    given = {name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()}
+    return inspect_file(Path(path), Reading(**given))
+
+
+@naming_arguments
 def judge(
     record: Record | str | Path | ArrayLike | None = None,
     covariances: ArrayLike | None = None,
@@ -287,12 +319,38 @@ def verdict_html(verdict: Verdict) -> str:
     return as_html.fragment(*blocks)
 
 
-def plot(record: Record, verdict: Verdict | None, path: str | Path | None) -> Any:
-    """See :meth:`Record.plot`."""
-    from consistency.referee.pages.record_figures import overview
+def plot(record: Record, verdict: Verdict | None, path: str | Path | None, figure: str | None = None) -> Any:
+    """See :meth:`Record.plot` and :meth:`Verdict.plot`."""
+    from consistency.referee.pages.record_figures import overview, record_figures
     from consistency.referee.pages.write_pages import plotted
 
     if record.errors.error is not None and not record.errors.axes:
         axes = numbered_axes(record.errors.error.shape[-1])
         record = replace(record, errors=replace(record.errors, axes=axes))
-    return plotted(overview(record, verdict), path)
+    if figure is None or verdict is None:
+        return plotted(overview(record, verdict), path)
+    of_report = {each.title: each.drawings for each in record_figures(record, verdict)}
+    if figure not in of_report:
+        raise InputError(f"figure={figure!r}: is not in the report; there are: {', '.join(of_report)}")
+    return plotted(of_report[figure][0], path)
+
+
+def write_verdict(verdict: Verdict, path: str | Path, overwrite: bool) -> list[Path]:
+    """See :meth:`Verdict.write`."""
+    from consistency.referee.pages.write_pages import (
+        is_one_file,
+        require_report,
+        write_file_reports,
+        write_text_file,
+    )
+    from consistency.referee.show.as_json import render
+
+    path = Path(path)
+    replaces = require_report(path, overwrite)
+    shown = document({verdict.filter: verdict}, path.name)
+    if is_one_file(path):
+        return [write_text_file(shown, path)]
+    if verdict.record is None:
+        raise InputError(f"{verdict.filter}: the record was not kept with the verdict; write FILE.xml or FILE.md")
+    judged = {verdict.filter: verdict}
+    return write_file_reports([verdict.record], judged, path, verdict.filter, render(document(judged)), replaces)

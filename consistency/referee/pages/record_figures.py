@@ -336,8 +336,8 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
             log_axis(axes, "y")
 
     caption = (
-        f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: where one step "
-        f"of a right estimator lies with 95 %, which is not judged.{clock.note}"
+        f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: 95 % of "
+        f"single steps of a right filter; for orientation only.{clock.note}"
     )
     return Picture("NEES", caption, (paint,), height=1.9)
 
@@ -413,7 +413,7 @@ def _single_nees(record: Record) -> Picture | None:
     plural_of = "windows" if record.runs.independent else f"{record.runs.unit}s"
     caption = (
         f"NEES of {what}; {record.errors.dof} is expected in the mean (line). Above is overconfident, below "
-        f"conservative. Shaded: where 95 % of the {plural_of} of a right estimator lie, which is not judged.{note}"
+        f"conservative. Shaded: 95 % of the {plural_of} of a right filter; for orientation only.{note}"
     )
     return Picture("NEES", caption, (paint,), height=1.9)
 
@@ -566,8 +566,8 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
 
     judged = verdict.innovations is not None and verdict.innovations.judged
     caption = (
-        "NIS over its degrees of freedom; 1 is expected (line). Shaded: where one step of white innovations lies with "
-        f"95 %.{'' if judged else ' Reported, not judged: no optimal gain is declared.'}{clock.note}"
+        "NIS over its degrees of freedom; 1 is expected (line). Shaded: 95 % of single steps of white innovations; "
+        f"for orientation only.{'' if judged else ' Reported, not judged: no optimal gain is declared.'}{clock.note}"
     )
     return Picture("Innovations", caption, (paint,), height=1.6)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,7 +106,9 @@ def write_text_file(document: Document, path: Path) -> Path:
     InputError
         The file cannot be written.
     """
-    write_file(path, f"{rendered(document, path)}{MARK}".encode())
+    from consistency.referee.system.folders import command_line
+
+    write_file(path, f"{rendered(replace(document, command=command_line()), path)}{MARK}".encode())
     return path
 
 

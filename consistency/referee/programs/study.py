@@ -23,7 +23,7 @@ from consistency.referee.diagnostics.records.record import Record, Skip
 from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.errors import InputError
+from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.gating.checked_input import planned_dof, rate_shares
 from consistency.referee.parsing import one_line
 from consistency.referee.programs.process import (
@@ -79,6 +79,7 @@ SAME = {  # keys of the manifest that a resumed study must have, and what they a
 }
 
 
+@naming_arguments
 def monte_carlo(
     argv: Sequence[str],
     runs: int | None = None,

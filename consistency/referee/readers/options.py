@@ -16,6 +16,8 @@ from consistency.referee.errors import InputError
 COLUMNS = "columns"  # covariance of the truth: of its own file
 REPEATS = "repeats"  # in place of a file of the truth
 GROUPED = ("by", "by_file", "bins")  # options
+ERRORS = ("so2", "vector", "left", "right", "so3", "so3-body", "rvec", "euler", "additive", "guess")
+MODES = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")  # of --align
 OF_AXES = ("world", "body_axes", "truth_world", "truth_body_axes")
 MAX_DT = 0.01  # s between an estimate and its truth: half a period of a 50 Hz truth
 
@@ -68,10 +70,16 @@ def _bins(text: str) -> int | list[float]:
 
 
 def _option(
-    help: str, metavar: str | None = None, parse: Callable[[str], Any] | None = None, flag: str | None = None
+    help: str,
+    metavar: str | None = None,
+    parse: Callable[[str], Any] | None = None,
+    flag: str | None = None,
+    values: Sequence[str] = (),
 ) -> Any:
     """An option: how the command line shows it, and what it makes of a text."""
-    return field(default=None, metadata={"help": help, "metavar": metavar, "parse": parse, "flag": flag})
+    return field(
+        default=None, metadata={"help": help, "metavar": metavar, "parse": parse, "flag": flag, "values": values}
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,13 +87,14 @@ class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 
     truth: Path | None = _option(
-        "Truth of the estimates, in the same form, or the folder of a KITTI drive; or 'repeats': runs of the same true "
-        "values, without truth."
+        "Truth in the form of the estimates, or a KITTI drive; 'repeats' where all runs have the same true values."
     )
-    covariance: Path | None = _option("Covariances of a TUM trajectory: t and 36 or 21 numbers.")
+    covariance: Path | None = _option("Covariances of a TUM trajectory: t, 36 or 21 numbers.")
     error: str | None = _option(
         "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
-        "guess."
+        "guess.",
+        "ERROR",
+        values=ERRORS,
     )
     state: Sequence[str] | None = _option("Columns of the state [x,y,heading].", "A,B,C", _names)
     covariance_order: str | None = _option(
@@ -96,15 +105,11 @@ class Reading:
     time_offset: float | str | None = _option(
         "Seconds to add to the timestamps of the estimates.", "S|estimate", _seconds
     )
-    axes: Sequence[str] | None = _option(
-        "Components of a trajectory to judge, such as x,y,yaw; in fit-covariance a number.", "A,B,C", _names
-    )
-    topic: str | None = _option("Topic of the estimates in a ROS bag: Odometry or PoseWithCovarianceStamped.")
-    truth_topic: str | None = _option("Topic of the truth in a ROS bag: poses, or PARENT:CHILD, two frames of /tf.")
+    axes: Sequence[str] | None = _option("Components of a trajectory to judge: x,y,yaw.", "A,B,C", _names)
+    topic: str | None = _option("Topic of the estimates in a ROS bag.")
+    truth_topic: str | None = _option("Topic of the truth in a ROS bag, or PARENT:CHILD, two frames of /tf.")
     body: str | None = _option("Body that a KITTI drive as truth refers to: imu [default], velodyne or camera.")
-    relative: str | float | None = _option(
-        "Judge motions over windows: N steps, seconds (10s), metres (50m).", "N|Ns|Nm", str
-    )
+    relative: str | float | None = _option("Judge motions over windows: steps, seconds, metres.", "N|Ns|Nm", str)
     motions: bool | None = _option(
         "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
     )
@@ -113,16 +118,15 @@ class Reading:
         "Treat each row, or window, as an independent run: a calibration, an image, a detection.", flag="--independent/"
     )
     align: str | None = _option(
-        "Move estimates into the world of the truth: none [default]; origin, by the first pose of each run; "
-        "posyaw or se3, by a frame fitted to each run; posyaw-all or se3-all, by one for all runs.",
+        "Move estimates into the world of the truth: none; origin, by the first pose of each run; posyaw or se3, by "
+        "a frame fitted to each run (posyaw-all, se3-all: to all).",
         "MODE",
+        values=MODES,
     )
     lever_arm: Sequence[float] | None = _option(
         "Point that a truth of positions measures, in the axes of the body, m.", "X,Y,Z", _lengths
     )
-    split: str | int | None = _option(
-        "Split one long log into N pieces treated as independent runs, or 'auto'.", "auto|N", str
-    )
+    split: str | int | None = _option("Split one log into N runs, taken as independent.", "auto|N", str)
     truth_covariance: str | None = _option(
         "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21 numbers.", "columns|FILE"
     )
@@ -138,7 +142,7 @@ class Reading:
     ends: str | None = _option(
         "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."
     )
-    by: str | None = _option("Judge groups by this column, too: bins of numbers, or words.", "COLUMN")
+    by: str | None = _option("Judge groups by this column, too: bins, or words.", "COLUMN")
     by_file: Path | None = _option("Table with that column and t, run or both.")
     bins: int | Sequence[float] | None = _option(
         "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
@@ -151,9 +155,7 @@ class Reading:
     truth_columns: Mapping[str, str] | None = _option(
         "What columns of the truth are called, as --columns.", "NAME=COLUMN,…", _columns
     )
-    world: str | None = _option(
-        "Axes of the world of the estimates, a letter each: enu [default], ned, nwu ...", "AXES"
-    )
+    world: str | None = _option("World axes of the estimates: enu [default], ned ...", "AXES")
     body_axes: str | None = _option("Axes of the body of the estimates: flu [default], frd ...", "AXES")
     truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
     truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")

@@ -17,6 +17,9 @@ def render(document: Document) -> str:
     failed = sum(not case.has_passed for case in cases)
     counts = f'tests="{len(cases)}" failures="{failed}" errors="0" skipped="0"'
     inside = "\n".join(_case(case, document.title) for case in cases)
+    if document.command:
+        command = f'<property name="command" value={_attribute(document.command)}/>'
+        inside = f"<properties>{command}</properties>\n{inside}"
     return (
         '<?xml version="1.0" encoding="utf-8"?>\n'
         f"<testsuites {counts}>\n<testsuite name={_attribute(document.title)} {counts}>\n{inside}\n</testsuite>\n"

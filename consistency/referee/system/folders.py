@@ -292,20 +292,25 @@ def manifest_of(kind: str = "results", **fields: Any) -> dict[str, Any]:
     wall = fields.pop("wall", None)
     if wall is not None:
         wall = round(wall, 3)
-    program = Path(sys.argv[0]).name
-    if program == "__main__.py":
-        program = "consistency"
     return {
         "schema_version": SCHEMA_VERSION,
         "kind": kind,
         "date": datetime.now(timezone.utc).date().isoformat(),
         "versions": dict(_versions()),
         "machines": [this_machine()],
-        "command": shlex.join([program, *sys.argv[1:]]),
+        "command": command_line(),
         "git_commit": _git_commit(),
         "wall_time_s": wall,
         **fields,
     }
+
+
+def command_line() -> str:
+    """The command line of this process, as a shell takes it."""
+    program = Path(sys.argv[0]).name
+    if program == "__main__.py":
+        program = "consistency"
+    return shlex.join([program, *sys.argv[1:]])
 
 
 @functools.cache

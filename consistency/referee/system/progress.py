@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any, TypeVar
@@ -34,7 +34,7 @@ class _Forgiving:
         return getattr(self._stream, name)
 
 
-EVERY = 5.0  # seconds between lines
+EVERY = 3.0  # seconds between lines
 _quiet = ContextVar("quiet", default=False)
 
 
@@ -68,23 +68,34 @@ def each(items: Iterable[T], total: int, label: str, unit: str) -> Iterator[T]:
             advance(1)
 
 
+def counted(items: Sequence[T], label: str, unit: str) -> Iterator[T]:
+    """The items, with progress over them if there are several and they take more than some seconds."""
+    if len(items) < 2:
+        yield from items
+        return
+    with progress(label, len(items), unit, brief=True) as advance:
+        for item in items:
+            yield item
+            advance(1)
+
+
 @contextmanager
 def progress(label: str, total: int, unit: str = "runs", brief: bool = False) -> Iterator[Advance]:
     """Yields a function to call with the number of units just done; writes to standard error.
 
-    ``brief``: where there is no terminal, nothing is said of what is over in a few seconds.
+    ``brief``: nothing remains on a terminal, and where there is none nothing is said of what is over in a few seconds.
     """
     if _quiet.get():
         yield lambda _: None
     elif sys.stderr is not None and sys.stderr.isatty():
-        with _bar(label, total, unit) as advance:
+        with _bar(label, total, unit, brief) as advance:
             yield advance
     else:
         yield _lines(label, total, unit, brief)
 
 
 @contextmanager
-def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
+def _bar(label: str, total: int, unit: str, brief: bool) -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -97,7 +108,7 @@ def _bar(label: str, total: int, unit: str) -> Iterator[Advance]:
         TextColumn("left"),
     )
     stream: Any = _Forgiving()
-    with Progress(*columns, console=Console(file=stream)) as bar:
+    with Progress(*columns, console=Console(file=stream), transient=brief) as bar:
         task = bar.add_task(label, total=total, rate="")
 
         def advance(count: int) -> None:

@@ -44,6 +44,9 @@ class Compared:
     same_runs: bool = True  # failures are of the same trials
     sources: tuple[str, str] = ("", "")  # files or folders of both, where they differ
 
+    def __str__(self) -> str:
+        return self.sentence
+
     @property
     def sentence(self) -> str:
         c = self.comparison
@@ -54,6 +57,8 @@ class Compared:
             found = "less consistent"
         if c.paired:
             way = "run by run on the same trials"
+        if c.at_most < 0.0:
+            found = f"at least {np.exp(-c.at_most):.3g} times nearer to consistent"
         text = f"{own} is {found} than {reference}: {c.runs} runs, {way}, p {c.p_value:.2g}"
         if c.distance == c.standard_error == 0.0:
             text += "; every run is the same in both"
@@ -62,7 +67,7 @@ class Compared:
                 f"; its covariance is farther too large, unless rare runs with a large NEES are missing here: up to "
                 f"{100.0 * c.unseen:.2g} % of all runs may be of a kind that {c.runs} do not show"
             )
-        elif not c.worse:
+        elif not c.worse and not c.at_most < 0.0:
             text += f"; {self._limit}"
             if not c.at_most < np.log(DETECT):
                 text += (
@@ -88,8 +93,6 @@ class Compared:
     def _limit(self) -> str:
         """How much farther off filter ``a`` may be that is not found worse."""
         most = self.comparison.at_most
-        if most < 0.0:
-            return f"nearer to consistent, by x{np.exp(-most):.3g} at least"
         if not np.isfinite(most):
             return "no difference shown"
         return f"no difference shown; at most x{np.exp(most):.3g} farther off"

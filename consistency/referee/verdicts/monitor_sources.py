@@ -13,6 +13,7 @@ import numpy as np
 from consistency.referee.diagnostics.monitor import Alarm, Monitor
 from consistency.referee.diagnostics.records.record import Skip
 from consistency.referee.errors import InputError
+from consistency.referee.readers.formats.file_kinds import is_bag
 from consistency.referee.readers.formats.flight_logs import STATED, ULOG_SUFFIX, is_dataflash, read_stated, read_ulog
 from consistency.referee.readers.formats.innovation_files import (
     DEFAULT,
@@ -74,6 +75,15 @@ def make_monitor(innovations: str | None, gate: str | float | None = None, **opt
     except ValueError as error:
         name, rest = str(error).split(" ", 1)
         raise InputError(f"--{name.replace('_', '-')} {rest}") from None
+
+
+def refuse_bags(path: Path) -> None:
+    """Refuse ROS bags, in which no innovations stand, by saying what is needed instead."""
+    if is_bag(path):
+        raise InputError(
+            f"{path}: a ROS bag holds poses and no innovations; for 'monitor' write a table of t, innovation and "
+            f"innovation_variance, or of nis and nis_dof; judge the poses beside a truth: consistency inspect {path}"
+        )
 
 
 def read_innovations(

@@ -1,8 +1,10 @@
 """How reproduce runs scripts: which of them, in which process, and what becomes of one that breaks."""
 
+import contextlib
 import json
 import os
 import time
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -153,6 +155,19 @@ def test_exit_status_of_each_verdict(tmp_path, monkeypatch, capsys, source, hold
         ended = exit_.exit_code
     assert ended == status
     assert capsys.readouterr().err.strip() == said
+
+
+@pytest.mark.parametrize(
+    "source, said", [("this project", "may be refuted: no failure)"), ("Herath 2007", "refuted: one")]
+)
+def test_a_conjecture_may_be_refuted(tmp_path, monkeypatch, capsys, source, said):
+    text = dict.fromkeys(("claim", "statistic", "published", "measured", "accept"), "text")
+    finding = replace(Study(jobs=1).finding(None, "none", id="one", source=source, **text), verdict="refuted")
+    monkeypatch.setattr(module, "reproduce", lambda *_: [finding])
+    monkeypatch.setattr("consistency.bench.pages.write_reports", lambda *_, **__: ())
+    with contextlib.suppress(typer.Exit):
+        reproduce_command(["one"], jobs=1, out=tmp_path)
+    assert capsys.readouterr().err.strip().endswith(said)
 
 
 def test_the_terminal_lists_what_was_not_run(scripts, tmp_path, monkeypatch, capsys):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import consistency
+from command import consistency, refused
 from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy.spatial.transform import Rotation
@@ -60,6 +60,15 @@ def test_one_command_from_bag_to_picture(tmp_path, capsys):
     out, _ = consistency(capsys, "analyse", bag, "--truth-topic", "/vicon", "--report", tmp_path / "out")
     assert "drive is " in out
     assert "Errors and stated bounds" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_what_the_monitor_needs_is_no_bag(tmp_path, capsys):
+    bag = write(tmp_path / "drive.bag", 1, "pose", Drive())
+    for path in (bag, tmp_path):
+        err = refused(capsys, "monitor", path)
+        assert "no innovations" in err
+        assert "innovation_variance" in err
+        assert err.endswith(f"consistency inspect {path}\n")
 
 
 def test_a_folder_of_bags_has_a_run_in_each(tmp_path):

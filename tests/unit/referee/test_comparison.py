@@ -344,8 +344,9 @@ def test_runs_that_show_that_nothing_is_lost_are_enough(rng):
     better = compare(of_runs(nees[:, 0]), of_runs(100.0 * nees[:, 0]))
     assert better.at_most < 0.0
     sentence = Compared("f", "f", better, (0, 0)).sentence
-    assert f"; nearer to consistent, by x{np.exp(-better.at_most):.3g} at least" in sentence
+    assert f"f is at least {np.exp(-better.at_most):.3g} times nearer to consistent than the reference" in sentence
     assert "no difference" not in sentence
+    assert "less consistent" not in sentence
     with pytest.raises(InsufficientTrials):
         assert_not_worse(nees_a=rng.chisquare(3, (10, 1)), nees_b=rng.chisquare(3, (10, 1)), dof=3, false_alarm=1e-9)
 

@@ -16,6 +16,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct import (
     are_needed,
     correct,
+    correction_lines,
     fit_groups,
     held_out_by,
     with_uncertainty,
@@ -218,6 +219,8 @@ def test_what_few_runs_add_is_what_a_ratio_has_more():
     nu = found.fit.dof[0]
     assert nu >= 27.0
     assert found.excess == pytest.approx(nu / (nu - 2.0))
+    assert any(f"which adds x{found.excess:.3g} to a" in line for line in correction_lines(found))
+    assert not any("are uncertain" in line for line in correction_lines(replace(found, excess=1.004)))
 
 
 # --- the three ends ---------------------------------------------------------------------------------------------------

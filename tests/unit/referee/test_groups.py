@@ -159,6 +159,18 @@ def verdict_by(column, **settings):
     return cs.judge(error, covariance, by={"mode": column}, **settings)
 
 
+@pytest.mark.parametrize("factor, side", [(2.0, "too small"), (0.5, "too large")])
+def test_a_fault_in_every_group_is_everywhere(factor, side):
+    """A standard error of 2 % tells factors of 4 and 16 apart."""
+    error = np.random.default_rng(5).normal(size=(400, 4, 2)) * factor
+    error[:, 2] *= factor
+    verdict = cs.judge(error, np.tile(np.eye(2), (400, 4, 1, 1)), by={"turn": np.tile([0, 1, 2, 3], (400, 1))}, bins=4)
+    sentence = verdict.reasons[0]
+    assert f"covariance {side} everywhere, most (x1" in sentence  # x16
+    assert "where 1 < turn <= 2" in sentence or "where turn 2" in sentence, sentence
+    assert ("ratio 0.0" in sentence) == (factor < 1.0)
+
+
 def test_the_wrong_group_is_named_and_where_it_is_right():
     error, covariance, column = wrong_in_the_first()
     error[column == 0] /= 2.0  # right everywhere: the same draws

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -315,3 +317,15 @@ def test_names_of_files_are_shown_as_they_are(tmp_path, rng):
     record = cs.read(tmp_path / "<b>a&b.npz")
     assert "<b>" not in record._repr_html_()
     assert "<b>" not in cs.judge(record)._repr_html_()
+
+
+def test_a_junit_file_names_the_command_that_wrote_it(tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng(1)
+    np.savez(tmp_path / "est.npz", errors=rng.normal(size=(40, 5, 2)), covariances=np.tile(np.eye(2), (40, 5, 1, 1)))
+    words = ["analyse", str(tmp_path / "est.npz"), "--report", str(tmp_path / "a <b>.xml")]
+    monkeypatch.setattr("sys.argv", ["/somewhere/consistency", *words])
+    consistency(capsys, *words)
+    suite = ElementTree.parse(tmp_path / "a <b>.xml").find("testsuite")
+    command = suite.find("properties/property[@name='command']").get("value")
+    assert shlex.split(command) == ["consistency", *words]
+    assert suite.find("testcase") is not None

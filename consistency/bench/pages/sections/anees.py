@@ -155,8 +155,8 @@ def anees_caption(anees: Anees) -> str:
         else ""
     )
     return (
-        f"{what}; {expected} is expected (line). Shaded: the 95 % band of a single step (eq. 17), which is not judged."
-        f"{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
+        f"{what}; {expected} is expected (line). Shaded: 95 % of single steps of a right filter (eq. 17); for "
+        f"orientation only.{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
         f"{''.join(map(_told, anees.curves))}"
     )
 

@@ -273,17 +273,38 @@ class Verdict(Findings):
     def _repr_html_(self) -> str:
         return str(shown_by("verdict_html", self))
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Errors with their bounds, NEES with its band, and coverage; arguments as those of :meth:`Record.plot`.
+    def plot(self, path: str | Path | None = None, figure: str | None = None) -> Any:
+        """Errors with their bounds, NEES with its band, trajectory and coverage.
+
+        Parameters
+        ----------
+        path : as of :meth:`Record.plot`
+        figure : title of a figure of the report, which is drawn alone: "Errors and stated bounds", "Trajectory"
 
         Raises
         ------
         InputError
-            The verdict was not made by ``consistency.judge``, or nothing can be drawn.
+            The verdict was not made by ``consistency.judge``, nothing can be drawn, or the report has no such figure.
         """
         if self.record is None:
             raise InputError(f"{self.filter}: the record was not kept with the verdict; draw record.plot() of it")
-        return shown_by("plot", self.record, self, path)
+        return shown_by("plot", self.record, self, path, figure)
+
+    def write(self, path: str | Path, overwrite: bool = False) -> list[Path]:
+        """Write the verdict as ``analyse --report`` does, and return the paths of what is written.
+
+        Parameters
+        ----------
+        path : a folder for the page, the PDF and the JSON; or FILE.xml (JUnit) or FILE.md
+        overwrite : replace also what is no earlier report
+
+        Raises
+        ------
+        InputError
+            Something else is there, it cannot be written, or the verdict was not made by ``consistency.judge``.
+        """
+        written: list[Path] = shown_by("write_verdict", self, path, overwrite)
+        return written
 
 
 def _axes_numbers(v: Verdict, axes: ComponentRatios) -> dict[str, Any]:

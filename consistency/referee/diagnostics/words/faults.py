@@ -556,6 +556,11 @@ def _faults(by: ByGroup) -> str:
     """The worst group and those beside it, then where the covariance is shown to be right."""
     worst = by.worst
     others = [group for group in by.groups if group.status in SIDES and group is not worst]
+    if len(others) == len(by.groups) - 1 > 1 and all(group.status == worst.status for group in others):
+        most = max(by.groups, key=lambda group: SIDES[group.status] * group.ratio.value)
+        size = off_by(most.ratio)
+        factor = size.partition(" by ")[2].replace(" (", ", ").removesuffix(")") or "hardly any error"
+        return f"covariance {size[:SIDE]} everywhere, most ({factor}) where {most.name}"
     text = f"covariance {off_by(worst.ratio)} where {worst.name}"
     if len(others) == 1:
         text += f", and {off_by(others[0].ratio)} where {others[0].name}"

@@ -328,9 +328,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
         from consistency.referee.diagnostics.words.faults import combination_text
 
-        lines.append(
-            f"no axis is shown to be wrong to that side by itself, only errors {combination_text(v)}; of all {of_all}"
-        )
+        lines.append(f"no single axis is shown wrong; the error is {combination_text(v)}")
     lines += _groups(v.by_group, v.unit)
     if v.lost is not None and _has_lost(v) and (v.lost.count or v.settings.lost is not None):
         lines.append(

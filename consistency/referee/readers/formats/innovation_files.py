@@ -75,6 +75,16 @@ def refuse_options(path: Path, r: Reading) -> None:
         raise InputError(f"--{option}: goes with tables, not with {path}")
 
 
+class SeveralError(InputError):
+    """Refusal of a file with several items of which one has to be chosen."""
+
+    def __init__(self, path: Path, option: str, there: Sequence[Any], what: str) -> None:
+        super().__init__(f"{path}: holds more than one {what} ({listed(there)}); choose with --{option}")
+        self.option = option
+        self.there = there
+        self.what = what
+
+
 def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "") -> Any:
     """The wanted item, or the only one; ``what`` describes the items in messages, if the option's name does not.
 
@@ -86,7 +96,7 @@ def choose(path: Path, option: str, there: list[Any], choice: Any, what: str = "
     if choice is None and len(there) == 1:
         return there[0]
     if choice is None:
-        raise InputError(f"{path}: holds more than one {what or option} ({listed(there)}); choose with --{option}")
+        raise SeveralError(path, option, there, what or option)
     if choice not in there:
         raise InputError(f"--{option} {choice}: is not in {path}; there are: {listed(there)}")
     return choice

@@ -116,13 +116,15 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
     Raises
     ------
     InputError
-        They are positions without orientations.
+        They are positions without orientations, or a quaternion has not length 1.
     """
     if lines.values.shape[1] < POSE_NUMBERS:
         raise InputError(
             f"{lines.path}: holds positions without orientations, and a planar pose needs a heading; give a file with "
             "a heading or a quaternion, or judge positions alone: --state x,y with a truth table of columns t, x, y"
         )
+    bad, length = not_unit(lines.values[:, 1:POSE_NUMBERS])
+    refuse(bad, lines.place, lambda row: f"the quaternion has length {length[row]:.4g}, not 1")
     ahead = Rotation.from_quat(lines.values[:, 4:POSE_NUMBERS]).apply([1.0, 0.0, 0.0])
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
     t, x, y = lines.values[:, :3].T

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from consistency.referee.readers.formats.tum import SpaceRun, poses_without_cova
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.runs_to_record import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
+from consistency.referee.system.progress import counted
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -36,6 +37,7 @@ PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
 UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
 TWIST = ("speed", "turn_rate", *(f"{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz"))  # for --by
 ENDLESS = 1e9  # a variance from which on it is not stated
+READING = ("reading", "bags")
 DAMAGED = "cannot be read as a ROS bag, damaged or cut short"
 Link = tuple[str, str]  # frames of a transform, parent and child
 Frames = tuple[str, str]  # of the world and of the body
@@ -60,14 +62,14 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     if not is_one_bag(path):
         bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
-        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in bags], r)]
+        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in counted(bags, *READING)], r)]
     if r.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
     require_spatial(r.error, SPATIAL)
     _require_whole(path, bags)
     why = "; as the ROS messages define it; declare yours with --error"
     mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
-    found = space_estimator(path, (_run_of(bag, r) for bag in bags), r, why, mixed)
+    found = space_estimator(path, (_run_of(bag, r) for bag in counted(bags, *READING)), r, why, mixed)
     if r.unstated and not any(one.covariance.any() for one in found.runs):
         return [found]
     judged, note = _stated(path, found.runs)
@@ -165,6 +167,37 @@ def _other_frames(bag: Path, estimates: tuple[str, Frames], truth: tuple[str, Fr
 
 
 # --- topics -----------------------------------------------------------------------------------------
+
+
+class Topic(NamedTuple):
+    """A topic of a bag."""
+
+    name: str
+    kind: str
+    messages: int
+    text: str  # its kind, messages, rate and frames
+
+
+def topics_of(path: Path) -> list[Topic]:
+    """The topics of a bag by name; of a folder of bags those of its first one.
+
+    Raises
+    ------
+    InputError
+        It cannot be read.
+    """
+    bag = path if is_one_bag(path) else min(filter(is_one_bag, path.iterdir()))
+    found = []
+    with _opened(bag) as reader:
+        seconds = SECOND * reader.duration
+        for name, topic in sorted(reader.topics.items()):
+            text = f"{name}  {topic.msgtype}, {topic.msgcount} messages"
+            if topic.msgcount > 1 and seconds > 0:
+                text += f", {topic.msgcount / seconds:.3g} Hz"
+            if topic.msgtype in POSES:
+                text += f", frames {' and '.join(filter(None, _frames(reader, name))) or 'without names'}"
+            found.append(Topic(name, topic.msgtype or "", topic.msgcount, text))
+    return found
 
 
 @contextmanager

@@ -32,12 +32,12 @@ from consistency.referee.readers.formats.file_kinds import (
     unknown_kind,
 )
 from consistency.referee.readers.options import GROUPED, OF_AXES, Reading, flag_of
+from consistency.referee.readers.options import MODES as ALIGNMENTS
 from consistency.referee.readers.pipeline.records import OF_WINDOWS, records_of, windows_asked
 from consistency.referee.readers.runs_to_record import with_failed_runs
 from consistency.referee.readers.truth_matching import Estimator
 
 CONVENTIONS = tuple(dict.fromkeys((*PLANAR, *INERTIAL)))
-ALIGNMENTS = ("none", "origin", "posyaw", "posyaw-all", "se3", "se3-all")
 IN_COLUMNS = ("so2", "so3", "so3-body", "vector", *CHARTS)  # differences of columns of positions and velocities
 GUESS = "guess"  # judge every convention
 NO_GUESS = {
@@ -52,6 +52,7 @@ OF_NAMES = ("columns", "truth_columns")
 OF_BOUNDS = ("level", "gaussian", "ends")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
+OF_OTHERS_THAN_ARCHIVES = (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES)
 ARCHIVE_KEYS = {
     "truth": "truth",
     "members": "members",
@@ -77,6 +78,7 @@ def is_program_runs(path: Path) -> bool:
 class Kind(NamedTuple):
     """A kind of files; its reader gives estimators, or records where a file holds no poses and no errors."""
 
+    name: str
     is_one: Callable[[Path, Reading], bool]
     refused: tuple[str, ...]  # options
     read: Callable[[Path, Reading, bool], Found]  # path, options, poses alone: covariances are not looked at
@@ -138,14 +140,12 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 
 KINDS = (  # a file is of the first that knows it
-    Kind(lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind(lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES, *OF_BOUNDS), _bags),
-    Kind(
-        _is_archive, (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES), _archive
-    ),
-    Kind(_is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
-    Kind(_is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind(_is_trajectory, (*OF_BAGS, *OF_BOUNDS, "state", *OF_TABLES), _trajectories),
+    Kind("runs of a program", lambda path, r: is_program_runs(path), (), _program_runs),
+    Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES, *OF_BOUNDS), _bags),
+    Kind("archive of arrays", _is_archive, OF_OTHERS_THAN_ARCHIVES, _archive),
+    Kind("table", _is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
+    Kind("folder of tables", _is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
+    Kind("trajectory", _is_trajectory, (*OF_BAGS, *OF_BOUNDS, "state", *OF_TABLES), _trajectories),
 )
 
 

@@ -174,7 +174,15 @@ def assemble(
     numbers = np.array([track.run for track in tracks], dtype=np.int64)
     return Record(
         name,
-        Errors(arrays["error"], arrays["covariance"], arrays["nees"], dof, axes, convention=convention),
+        Errors(
+            arrays["error"],
+            arrays["covariance"],
+            arrays["nees"],
+            dof,
+            axes,
+            convention=convention,
+            bound_ratios=arrays["bound_ratios"],
+        ),
         InnovationRecord(arrays["nis"], arrays["nis_dof"]),
         Runs(numbers, t=t, times=arrays["t"], by=arrays["by"]),
         tuple(failures),

@@ -151,7 +151,7 @@ def test_runs_without_a_definite_joint_covariance_are_named():
     evidence = map_of_gaussians(rng, rng.standard_normal((RUNS, NUMBER)) @ np.linalg.cholesky(P).T, P)
     broken = np.where(np.arange(RUNS) == 4, np.inf, evidence.map.joint.map)
     numbers = np.arange(100, 100 + RUNS)
-    v = judge(changed(evidence, joint=replace(evidence.map.joint, map=broken), runs=numbers), Settings(1e-6))
+    v = judge(changed(evidence, joint=replace(evidence.map.joint, map=broken), numbers=numbers), Settings(1e-6))
     assert v.status == "failed"
     assert v.joint.not_definite == (104,)
     assert "not positive definite in 1 of 30 runs, first run 104" in v.reasons[0]

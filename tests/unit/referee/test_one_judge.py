@@ -65,7 +65,7 @@ def whole_record():
     counts = (np.full(RUNS, n) for n in (10, 4, 3, 2))
     return record(
         convention="left", align="", caption="as fitted", causes=("a probable mix-up",), notes=("a note",),
-        world=Errors(3.0 * error, identities(error)), map=lambda: map_of(RUNS),
+        world=Errors(3.0 * error, identities(error)), read=lambda: map_of(RUNS),
         rejections=Rejections(np.arange(RUNS), *counts),
     )  # fmt: skip
 
@@ -116,7 +116,7 @@ def test_a_look_has_what_stands_beside_the_errors_of_its_runs():
     assert verdict.map.verdict is None, "a look has the scores of the maps alone"
     assert verdict.world.convention is None
     assert verdict.world.notes == ()
-    errors = changed(given.in_world, map=None, rejections=None)
+    errors = changed(given.in_world, read=None, rejections=None)
     assert verdict.world.answers == follow(Design(3), errors.first_runs, 12)[0].answers
     assert verdict.world.answers != judge(errors.first_runs(12)).answers, "a look costs a part of the rate"
 

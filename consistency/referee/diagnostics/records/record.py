@@ -381,6 +381,8 @@ class Record:
         if not self.runs.independent:
             return self
         judged = [values for values in (self.errors.nees, self.innovations.nis) if values is not None]
+        if self.errors.bound_ratios is not None:
+            judged += [*np.moveaxis(self.errors.bound_ratios, -1, 0)]
         there = np.any([np.isfinite(values) for values in judged], axis=0)
         number = np.arange(1, there.size + 1).reshape(there.shape)
         unit = "row" if self.origin.window is None else "window"

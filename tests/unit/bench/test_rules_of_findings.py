@@ -183,3 +183,15 @@ def test_the_plane_of_a_wide_baseline_is_linear_and_of_a_narrow_one_is_not(proje
     assert flat.rejecting < 0.2
     assert flat.shared > 0.97
     np.testing.assert_allclose(flat.measured[1], flat.linear, rtol=0.1, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "alike"),
+    [
+        ([("overconfident", "overconfident"), ("consistent", "consistent")], True),
+        ([("overconfident", "overconfident"), ("consistent", "undecided")], None),
+        ([("undecided", "consistent"), ("overconfident", "consistent")], False),
+    ],
+)
+def test_worlds_that_differ_where_one_is_undecided_show_nothing(pairs, alike):
+    assert experiment("e07_other_worlds").are_alike(pairs) is alike

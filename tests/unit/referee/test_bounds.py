@@ -433,15 +433,15 @@ def test_what_has_no_level_is_refused():
         (lambda x, y: {"x_low": x + 1, "x_high": x - 1}, "--level 95%", ("x_low", "above x_high")),
         (lambda x, y: {"x_low": x + 1, "x_high": x + 2}, "--level 95%", ("outside x_low", "without a column 'x'")),
         (lambda x, y: {"bound_x": 1.0}, "", ("bound_x", "--level 95%")),
-        (lambda x, y: {"h_acc": 1.0}, "--level 95%", ("radius_x_y", "--columns", "'bounds'", "gaussian=")),
+        (lambda x, y: {"h_acc": 1.0}, "--level 95%", ("radius_x_y", "--columns", "'bounds'", "--gaussian")),
         (lambda x, y: {"bound_x": 1.0}, "--level bound_y=95%", ("bound_y", "there are: bound_x")),
         (lambda x, y: {"bound_x": 1.0, "bound_y": 1.0}, "--level bound_x=95%", ("none for bound_y",)),
-        (lambda x, y: {"bound_x": 1.0}, "gaussian=", ("--gaussian", "--level 95%")),
+        (lambda x, y: {"bound_x": 1.0}, "--gaussian", ("--gaussian", "--level 95%")),
         (lambda x, y: {"bound_x": 1.0}, "--ends independent", ("--ends", "--level 95%")),
         (lambda x, y: {"bound_x": 1.0}, "--level 95% --ends late", ("--ends late", "'independent'")),
         (lambda x, y: {"bound_x": 1.0}, "--level 95% --split 4", ("--level", "--split")),
-        (lambda x, y: {"bound_x": 1.0, "radius_x_y": 1.0}, "--level 95% --gaussian", ("gaussian=", "x has several")),
-        (lambda x, y: {"bound_x": 1.0}, "--level 95% --gaussian --ends independent", ("--ends", "gaussian=")),
+        (lambda x, y: {"bound_x": 1.0, "radius_x_y": 1.0}, "--level 95% --gaussian", ("--gaussian", "x has several")),
+        (lambda x, y: {"bound_x": 1.0}, "--level 95% --gaussian --ends independent", ("--ends", "--gaussian")),
         (lambda x, y: {"bound_z": 1.0}, "--level 95% --state x,y", ("bound_z", "--state")),
     ],
 )  # fmt: skip
@@ -471,8 +471,8 @@ def test_commands_for_covariances_refuse_bounds(tmp_path, capsys):
     path = table(tmp_path / "est.csv", lambda x, y: {"bound_x": 2.0})
     program = ("--out", tmp_path / "o", "--", "true")
     for words in (("baseline", path, "--out", tmp_path / "b.json"), ("compare", path, path)):
-        assert "gaussian=" in refused(capsys, *words, "--level", "95%")
-    assert "gaussian=" in refused(capsys, "monte-carlo", "--level", "95%", *program)
+        assert "--gaussian" in refused(capsys, *words, "--level", "95%")
+    assert "--gaussian" in refused(capsys, "monte-carlo", "--level", "95%", *program)
 
 
 # --- gates, plan, reports ------------------------------------------------------------------------------------------

@@ -19,5 +19,5 @@ def worst_command(
     import numpy as np
 
     for record in read_files(path, files):
-        means = np.nanmean(record.nees, axis=1)
-        print(f"{record.name}: run {record.runs[means.argmax()]}, mean NEES {means.max():.4g}")
+        means = np.nanmean(record.errors.nees, axis=1)
+        print(f"{record.name}: run {record.run_numbers[means.argmax()]}, mean NEES {means.max():.4g}")

@@ -93,7 +93,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
     own = arrays.get("errors", arrays.get("estimates"))
     if r.unstated and "covariances" not in arrays and own is not None:
-        arrays = {**arrays, "covariances": np.broadcast_to(np.eye(own.shape[-1]), (*own.shape, own.shape[-1]))}
+        arrays = {**arrays, "covariances": np.zeros((*own.shape, own.shape[-1]))}
     archive = Archive(path, arrays)
     kind = _kind(archive, r)
     if kind == OF_NEES:

@@ -39,6 +39,7 @@ from consistency.referee.fit_covariance.factors import (
     steps_of_runs,
 )
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
 
@@ -185,7 +186,7 @@ def correct(
         unit = np.broadcast_to(np.eye(shape[-1] if shape else 1), (*shape, *shape[-1:]))
         given = {"errors": record, "covariances": unit if covariances is None else covariances}
         record = record_of_arrays(given, axes, "estimator", independent)
-        record = replace(record, assumed=covariances is None)
+        record = replace(rows_as_runs(record) if independent else record, assumed=covariances is None)
     require_runs(record)
     _, _, nees = stated_errors(record)
     labels = tuple(map(str, record.run_numbers if names is None else names))

@@ -213,17 +213,12 @@ class Record:
 
     @property
     def as_runs(self) -> Record:
-        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none.
-
-        Runs of one step keep their numbers.
-        """
+        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none."""
         if not self.independent:
             return self
         judged = [values for values in (self.nees, self.nis) if values is not None]
         there = np.any([np.isfinite(values) for values in judged], axis=0)
         number = np.arange(1, there.size + 1).reshape(there.shape)
-        if there.shape[1] == 1 and self.window is None:
-            number = self.run_numbers[:, None]
         rows = [int(np.flatnonzero(self.run_numbers == f.run)[0]) for f in self.failures]
         at = [(row, f.step - 1) for row, f in zip(rows, self.failures, strict=True)]
         for place in at:

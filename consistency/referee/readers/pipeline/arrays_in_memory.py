@@ -32,6 +32,7 @@ def record_of_arrays(
     ----------
     given : errors with covariances or deviations, or nees with dof; steps that are masked in a masked array of any
         of them have no truth and do not count
+    independent : rows are runs, which the record has as steps of one run: :func:`rows_as_runs` makes runs of them
 
     Raises
     ------
@@ -45,7 +46,7 @@ def record_of_arrays(
         if arrays["errors"].ndim == 3:  # of runs whose steps are independent, too
             arrays = {key: array.reshape(-1, *array.shape[2:]) for key, array in arrays.items()}
         _require_rows({key: array.shape for key, array in arrays.items()})
-        arrays = {key: array[:, None] for key, array in arrays.items()}
+        arrays = {key: array[None] for key, array in arrays.items()}
     if first == "errors" and "covariances" in arrays:
         require_layout(first, arrays[first].shape, arrays["covariances"].shape)
     shape = arrays[first].shape
@@ -76,7 +77,7 @@ def record_of_arrays(
             continue
         there = np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1)
         never = ~(there | mask).any(axis=0)
-        if never.any():
+        if never.any() and not independent:
             step = int(np.argmax(never)) + 1
             if sigma is not None and key == "covariances":
                 key = "deviations"
@@ -88,18 +89,13 @@ def record_of_arrays(
     try:
         record = estimator_of_arrays(Path("arrays"), arrays, Reading())
         if isinstance(record, Estimator):
-            (record,) = records_of(record, Reading())
+            (record,) = records_of(record, Reading(independent=independent or None))
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
     if sigma is not None:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
-    record = replace(record, name=require_name(name, "name"), failures=failures, independent=independent)
-    if not independent:
-        return record
-    from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
-
-    return rows_as_runs(record)
+    return replace(record, name=require_name(name, "name"), failures=failures)
 
 
 def _in_python(message: str, deviations: bool) -> str:

@@ -458,7 +458,7 @@ def _sigma(floor: Interval, block: str) -> str:
 def _figures(found: Correction) -> Table:
     columns = (Column("held-out"), Column("stated"), Column("corrected"), Column("expected", number=True))
     before, after = found.before, found.after
-    rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
+    rows: list[tuple[str, ...]] = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
     for level, stated, corrected in zip(LEVELS, before.covered(LEVELS), after.covered(LEVELS), strict=True):
         rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
     is_shown = (True, not found.assumed, True, True)

@@ -147,21 +147,18 @@ def test_rows_that_seem_to_depend_on_each_other_are_doubted(tmp_path, capsys):
 
 
 def test_windows_are_rows_by_the_other_option(tmp_path):
-    """--independent with --relative is --windows independent."""
-    rng = np.random.default_rng(9)
-    n = 60
-    motion = np.column_stack([np.full(n, 0.5), np.zeros(n), np.full(n, 0.02)])
-    sigma = np.array([0.02, 0.01, 0.004])
-    np.savez(
-        tmp_path / "m.npz", estimates=(motion + sigma * rng.normal(size=(n, 3)))[None],
-        truth=np.column_stack([0.5 * np.arange(n), np.zeros(n), np.zeros(n)])[None],
-        covariances=np.broadcast_to(np.diag(sigma**2), (1, n, 3, 3)),
-    )  # fmt: skip
-    one, other = (
-        cs.judge(cs.read(tmp_path / "m.npz", relative=1, motions=True, **how)).reasons
-        for how in ({"windows": "independent"}, {"independent": True})
+    """--independent with --relative is --windows independent: here of poses with cross-covariances."""
+    n, sigma = 40, np.array([0.02, 0.01, 0.004])
+    truth = np.column_stack([0.5 * np.arange(n), np.zeros(n), np.zeros(n)])
+    P = np.broadcast_to(np.diag(sigma**2), (n, 3, 3))
+    estimates = truth + sigma * np.random.default_rng(9).normal(size=(n, 3))
+    np.savez(tmp_path / "m.npz", estimates=estimates, truth=truth, covariances=P, cross_covariances=0.0 * P)
+    one, other, neither = (
+        cs.judge(cs.read(tmp_path / "m.npz", relative=1, **how))
+        for how in ({"windows": "independent"}, {"independent": True}, {})
     )
-    assert one == other
+    assert one.reasons == other.reasons
+    assert (other.unit, other.runs, neither.runs) == ("window", n - 1, 1)
 
 
 @pytest.mark.parametrize(

@@ -91,9 +91,9 @@ def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
 
 def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
-    own = arrays.get("errors", arrays.get("estimates"))
-    if r.unstated and "covariances" not in arrays and own is not None:
-        arrays = {**arrays, "covariances": np.zeros((*own.shape, own.shape[-1]))}
+    states = arrays.get("errors", arrays.get("estimates"))
+    if r.unstated and "covariances" not in arrays and states is not None:
+        arrays = {**arrays, "covariances": np.zeros((*states.shape, *states.shape[-1:]))}
     archive = Archive(path, arrays)
     kind = _kind(archive, r)
     if kind == OF_NEES:

@@ -196,4 +196,7 @@ def test_one_diagonal_covariance_of_the_wrong_shape_is_told_of_a_factor_an_axis(
 
     lines = " ".join(correction_lines(cs.correct(errors, P, axes=["x", "y", "z"])))
     assert "--per axis finds a variance for each component" in lines
-    assert "--per axis" not in " ".join(correction_lines(cs.correct(errors, P, axes=["x", "y", "z"], per_axis=True)))
+    alike = errors + errors[..., ::-1]  # which no factor mends
+    by_axis = cs.correct(alike, P, axes=["x", "y", "z"], per_axis=True)
+    assert by_axis.status == "inconsistent"
+    assert "--per axis" not in " ".join(correction_lines(by_axis))

@@ -39,6 +39,7 @@ from consistency.referee.fit_covariance.factors import (
     steps_of_runs,
 )
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
@@ -186,6 +187,7 @@ def correct(
         unit = np.broadcast_to(np.eye(shape[-1] if shape else 1), (*shape, *shape[-1:]))
         given = {"errors": record, "covariances": unit if covariances is None else covariances}
         record = record_of_arrays(given, axes, "estimator", independent)
+        record = rows_as_runs(record) if independent else record
         record = replace(record, errors=replace(record.errors, assumed=covariances is None))
     require_runs(record)
     _, _, nees = stated_errors(record)
@@ -462,7 +464,7 @@ def _sigma(floor: Interval, block: str) -> str:
 def _figures(found: Correction) -> Table:
     columns = (Column("held-out"), Column("stated"), Column("corrected"), Column("expected", number=True))
     before, after = found.before, found.after
-    rows = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
+    rows: list[tuple[str, ...]] = [("covariance ratio", shown(before.ratio), shown(after.ratio), "1")]
     for level, stated, corrected in zip(LEVELS, before.covered(LEVELS), after.covered(LEVELS), strict=True):
         rows.append((f"inside {level:.0%}", f"{stated:.1%}", f"{corrected:.1%}", f"{level:.0%}"))
     is_shown = (True, not found.assumed, True, True)

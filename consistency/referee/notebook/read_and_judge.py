@@ -280,6 +280,10 @@ def judge(
         raise InputError("independent: is for errors and paths; of a record, give independent=True to consistency.read")
     if by is not None or bins is not None:
         record = with_groups(record, by, bins)
+    if record.runs.independent and record.origin.window is None:
+        from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
+
+        record = rows_as_runs(record)
     record = record.without_first(skip_asked(skip))
     if optimal_gain:
         record = record.with_optimal_gain()

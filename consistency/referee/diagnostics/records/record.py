@@ -374,10 +374,7 @@ class Record:
 
     @property
     def as_runs(self) -> Record:
-        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none.
-
-        Runs of one step keep their numbers.
-        """
+        """Independent rows or windows as runs of a single step, numbered from 1; those without an error are none."""
         if not self.runs.independent:
             return self
         judged = [values for values in (self.errors.nees, self.innovations.nis) if values is not None]
@@ -385,9 +382,6 @@ class Record:
             judged += [*np.moveaxis(self.errors.bound_ratios, -1, 0)]
         there = np.any([np.isfinite(values) for values in judged], axis=0)
         number = np.arange(1, there.size + 1).reshape(there.shape)
-        unit = "row" if self.origin.window is None else "window"
-        if there.shape[1] == 1 and unit == "row":
-            number = self.run_numbers[:, None]
         rows = [int(np.flatnonzero(self.run_numbers == f.run)[0]) for f in self.failures]
         at = [(row, f.step - 1) for row, f in zip(rows, self.failures, strict=True)]
         for place in at:
@@ -395,6 +389,7 @@ class Record:
         failed = (replace(f, run=int(number[place]), step=1) for place, f in zip(at, self.failures, strict=True))
         unnumbered = replace(self, runs=replace(self.runs, numbers=None))
         found = unnumbered.changed(lambda array: array[there][:, None])
+        unit = "row" if self.origin.window is None else "window"
         runs = Runs(number[there], unit, np.full(1, np.nan), found.runs.times, found.runs.by, skipped=self.runs.skipped)
         return replace(found, runs=runs, failures=tuple(failed), origin=replace(found.origin, files={}))
 

@@ -107,9 +107,9 @@ def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
 
 def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
-    own = arrays.get("errors", arrays.get("estimates"))
-    if r.unstated and "covariances" not in arrays and own is not None:
-        arrays = {**arrays, "covariances": np.broadcast_to(np.eye(own.shape[-1]), (*own.shape, own.shape[-1]))}
+    states = arrays.get("errors", arrays.get("estimates"))
+    if r.unstated and "covariances" not in arrays and states is not None:
+        arrays = {**arrays, "covariances": np.zeros((*states.shape, *states.shape[-1:]))}
     archive = Archive(path, arrays)
     bounds = sizes = None
     if "bounds" in archive or r.level is not None:
@@ -124,9 +124,9 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     if kind == OF_MEMBERS:
         return _of_members(archive, r)
     if kind == OF_REPEATS:
-        own = archive.array("estimates", 3)
-        first = np.take_along_axis(own, np.argmax(np.isfinite(own), axis=0)[None], axis=0)  # any value would do
-        archive = Archive(path, {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, own.shape))})
+        repeats = archive.array("estimates", 3)
+        first = np.take_along_axis(repeats, np.argmax(np.isfinite(repeats), axis=0)[None], axis=0)  # any would do
+        archive = Archive(path, {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, repeats.shape))})
     if kind != OF_NEES:
         require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
     if kind == OF_ERRORS:

@@ -37,7 +37,8 @@ def record_of_arrays(
     given : errors or estimates with covariances or deviations, or members with truth, or nees with dof; estimates are
         repeats of the same true values. Steps that are masked in a masked array of any
         of them have no truth and do not count
-    options : level of bounds, and what is declared of them
+    independent : rows are runs, which the record has as steps of one run: :func:`rows_as_runs` makes runs of them
+    reading : level of bounds, and what is declared of them
 
     Raises
     ------
@@ -46,14 +47,14 @@ def record_of_arrays(
         finite in any run.
     """
     first = next(iter(given))
-    reading = reading or Reading()
+    reading = replace(reading or Reading(), independent=independent or None)
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
         if arrays[first].ndim == 3 and first == "errors":  # of runs whose steps are independent, too
             arrays = {key: array.reshape(-1, *array.shape[2:]) for key, array in arrays.items()}
         if first != "members":  # whose shapes are compared below
             _require_rows(first, {key: array.shape for key, array in arrays.items()})
-        arrays = {key: array[:, None] for key, array in arrays.items()}
+        arrays = {key: array[None] for key, array in arrays.items()}
     if first in ("errors", "estimates") and "covariances" in arrays:
         require_layout(first, arrays[first].shape, arrays["covariances"].shape)
     shape = arrays[first].shape
@@ -90,7 +91,7 @@ def record_of_arrays(
             continue
         there = np.isfinite(array).reshape(*array.shape[:2], -1).all(axis=-1)
         never = ~(there | mask).any(axis=0)
-        if never.any():
+        if never.any() and not independent:
             step = int(np.argmax(never)) + 1
             if sigma is not None and key == "covariances":
                 key = "deviations"
@@ -113,13 +114,7 @@ def record_of_arrays(
     if sigma is not None and not record.errors.bounds:
         record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
-    runs = replace(record.runs, independent=independent)
-    record = replace(record, name=require_name(name, "name"), failures=failures, runs=runs)
-    if not independent:
-        return record
-    from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
-
-    return rows_as_runs(record)
+    return replace(record, name=require_name(name, "name"), failures=failures)
 
 
 def _in_python(message: str, deviations: bool) -> str:

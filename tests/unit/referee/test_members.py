@@ -176,19 +176,27 @@ def test_few_members_do_not_make_a_wrong_ensemble_consistent():
     assert verdict.scale.equivalence.interval[1] > 1.5
 
 
+def test_few_right_members_are_undecided():
+    """m = 3 must show mean squares within 1.10 of 1, which 60 runs do not, though they show them within 1.5."""
+    truth, members = drawn(32, 3, 60, root=np.eye(1))
+    verdict = cs.judge(members=members, truth=truth, false_alarm=RARE)
+    assert verdict.status == "undecided"
+    assert 0.75 < verdict.scale.mean_anees < 1.3
+
+
 def test_the_tolerance_is_of_the_covariance():
     """m = 5 shows a ratio of 1.7 as 1.2."""
     truth, members = drawn(17, 5, 600, ratio=1.7, root=np.eye(1))
     assert cs.judge(members=members, truth=truth).status == "overconfident"
-    assert cs.judge(members=members, truth=truth, tolerance=1.25).status == "overconfident"
+    assert cs.judge(members=members, truth=truth, tolerance=1.4).status == "overconfident"
     assert cs.judge(members=members, truth=truth, tolerance=2.5, detect=2.5, false_alarm=1e-3).status == "consistent"
 
 
 def test_groups_have_ratios_of_the_covariance():
-    truth, members = drawn(18, 10, 200, 6, root=np.eye(1))
+    truth, members = drawn(18, 5, 300, 6, root=np.eye(1))
     truth[:, 3:] *= 2.0
-    by = np.tile(np.repeat(["calm", "windy"], 3), (200, 1))
-    verdict = cs.judge(*mean_and_covariance(truth, members), ensemble=10, by={"weather": by})
+    by = np.tile(np.repeat(["calm", "windy"], 3), (300, 1))
+    verdict = cs.judge(*mean_and_covariance(truth, members), ensemble=5, by={"weather": by})
     calm, windy = verdict.by_group.groups
     assert (calm.status, windy.status) == ("consistent", "overconfident")
     assert windy.ratio.value == pytest.approx(4.0, rel=0.3)

@@ -222,6 +222,16 @@ def test_members_that_are_not_more_than_components_are_judged_one_by_one():
     assert cs.judge(e, deviations=sigma, ensemble=3, axes=["x", "y", "z"]).p_value == verdict.p_value
 
 
+def test_deviations_of_members_are_mapped_one_by_one():
+    truth, members = drawn(33, 6, 10)
+    e, P = mean_and_covariance(truth, members)
+    sigma = np.sqrt(np.diagonal(P, axis1=2, axis2=3))
+    record = cs.judge(e, deviations=sigma, ensemble=6).record
+    expected = stats.norm.ppf(stats.t.cdf(e / sigma / np.sqrt(1 + 1 / 6), 5))
+    np.testing.assert_allclose(record.error, expected, rtol=1e-6)
+    assert record.parts == ((0,), (1,), (2,))
+
+
 def test_a_run_without_members_from_a_step_on_has_failed():
     truth, members = drawn(21)
     members[2, 3:] = np.nan

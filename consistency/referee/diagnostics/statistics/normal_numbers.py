@@ -266,7 +266,7 @@ def of_repeats(record: Record) -> Record:
         raise InputError(f"--truth repeats: {record.name} needs estimates of 2 runs or more, with covariances")
     error = np.full(record.error[1:].shape, np.nan)
     covariance = np.full(record.covariance[1:].shape, np.nan)
-    counted = np.isfinite(record.error).all(axis=-1) & every_entry(np.isfinite, record.covariance)
+    counted: Array = np.isfinite(record.error).all(axis=-1) & every_entry(np.isfinite, record.covariance)
     if record.nees is not None:  # a covariance that is singular, or not positive definite, is of no use
         counted &= np.isfinite(record.nees)
     mean = np.where(counted[0, :, None], record.error[0], 0.0)

@@ -100,6 +100,8 @@ def record_of_arrays(
         record = estimator_of_arrays(Path("arrays"), arrays, reading)
         if isinstance(record, Estimator):
             (record,) = records_of(record, reading)
+        if sigma is not None:
+            record = each_alone(record)
         if ensemble is not None or first == "estimates":
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
 
@@ -107,8 +109,6 @@ def record_of_arrays(
             record = record if ensemble is None else of_ensemble(record, ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
-    if sigma is not None:
-        record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 

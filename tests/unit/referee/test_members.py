@@ -176,6 +176,15 @@ def test_few_members_do_not_make_a_wrong_ensemble_consistent():
     assert verdict.scale.equivalence.interval[1] > 1.5
 
 
+def test_a_ratio_beyond_what_members_show_is_a_bound():
+    truth, members = drawn(34, 3, 60, ratio=1e6, root=np.eye(1))
+    verdict = cs.judge(members=members, truth=truth)
+    assert verdict.inflation_interval[1] == np.inf
+    assert verdict.inflation_interval[0] > 5.0
+    assert "at least x" in verdict.reasons[0]
+    assert "a few runs" not in verdict.reasons[0]
+
+
 def test_few_right_members_are_undecided():
     """m = 3 must show mean squares within 1.10 of 1, which 60 runs do not, though they show them within 1.5."""
     truth, members = drawn(32, 3, 60, root=np.eye(1))

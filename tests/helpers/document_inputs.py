@@ -132,6 +132,25 @@ def planar(folder, steps=20):
     table(folder / "truth.csv", [key | dict.fromkeys(names, 0.0) for key in keys])
 
 
+def ensembles(folder):
+    """members.npz and forecast.csv with members, ensemble.npz with their mean and covariance, repeats.csv."""
+    draws = RNG.normal(size=(40, 10, 11, 2))
+    truth, members = draws[:, :, 0], draws[:, :, 1:]
+    np.savez(folder / "members.npz", members=members, truth=truth)
+    rows = []
+    for run, step in np.ndindex(40, 10):
+        row = {"run": run, "step": step + 1} | dict(zip(("true_x", "true_y"), truth[run, step], strict=True))
+        for axis, own in zip(("ex", "ey"), members[run, step].T, strict=True):
+            row |= {f"{axis}{k + 1}": value for k, value in enumerate(own)}
+        rows.append(row)
+    table(folder / "forecast.csv", rows)
+    mean = members.mean(axis=2, keepdims=True)
+    P = np.swapaxes(members - mean, 2, 3) @ (members - mean) / 9
+    np.savez(folder / "ensemble.npz", errors=truth - mean[:, :, 0], covariances=P)
+    variances = dict.fromkeys(("P_xx", "P_yy", "P_zz"), 1.0) | dict.fromkeys(("P_xy", "P_xz", "P_yz"), 0.0)
+    table(folder / "repeats.csv", [dict(zip("xyz", RNG.normal(size=3), strict=True)) | variances for _ in range(20)])
+
+
 def grouped(folder):
     """est.csv with columns to group by, and truth.csv; est.txt, truth.txt, P.txt with a table beside them."""
     trajectories(folder)
@@ -297,6 +316,7 @@ PREPARE = {
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],
+    "docs/what-can-be-stated.md": [ensembles],
 }  # of a page, or of a part of it that has a folder of its own
 
 # --- names that the reader brings --------------------------------------------------------------------------

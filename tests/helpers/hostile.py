@@ -178,6 +178,7 @@ def write_all(folder, seed=1):
     pose = rng.standard_normal((4, STEPS, 3))
     both = {"estimates": pose, "truth": pose + error, "covariances": _matrices(rng, 4, STEPS)}
     np.savez(folder / "archive" / "pair.npz", **both, lengths=np.full(4, STEPS))
+    np.savez(folder / "archive" / "members.npz", members=rng.normal(size=(4, STEPS, 5, 3)), truth=both["truth"])
     np.savez(folder / "archive" / "nees.npz", nees=rng.chisquare(3, (4, STEPS)), dof=3)
     savemat(folder / "archive" / "est.mat", {"errors": error, "covariances": _matrices(rng, 4, STEPS), **extra})
     entries = dict(zip(("P_xx", "P_xy", "P_xh", "P_yy", "P_yh", "P_hh"), NUMBERED, strict=True))
@@ -349,6 +350,9 @@ TARGETS = (
     Target("archive", ("pair.npz",), command("analyse", "{}/pair.npz"), m.ANY | m.ARCHIVE, {}),
     Target("archive", ("est.mat",), command("analyse", "{}/est.mat"), m.ANY, {}),
     Target("archive", ("nees.npz",), command("analyse", "{}/nees.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("members.npz",), command("analyse", "{}/members.npz"), m.ANY | m.ARCHIVE, {}),
+    Target("archive", ("est.npz",), command("analyse", "{}/est.npz", "--ensemble", "9"), m.ANY | m.ARCHIVE, {}),
+    Target("table", ("est.csv",), command("analyse", "{}/est.csv", "--truth", "repeats"), m.ANY | m.TEXT, {}),
     Target("archive", ("est.npz",), command("monitor", "{}/est.npz", "--run", "1", *OPTIMAL),
            m.ANY | m.ARCHIVE, {}),
     Target("tum", ("est.tum", "truth.tum", "cov.txt"),

@@ -117,7 +117,11 @@ def test_innovations_of_rows_are_runs(tmp_path, capsys):
     rows = "\n".join(f"{k + 1},{v!r},2" for k, v in enumerate(nis.tolist()))
     (tmp_path / "nis.csv").write_text(f"step,nis,nis_dof\n{rows}\n")
     (record,) = read_recordings(tmp_path / "nis.csv", Reading(independent=True))
-    assert (record.innovations.nis.shape, record.innovations.nis_dof.shape, record.runs.unit) == ((60, 1), (60, 1), "row")
+    assert (record.innovations.nis.shape, record.innovations.nis_dof.shape, record.runs.unit) == (
+        (60, 1),
+        (60, 1),
+        "row",
+    )
     assert record.innovations.nis[:, 0] == pytest.approx(nis)
 
 

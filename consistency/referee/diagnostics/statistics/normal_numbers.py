@@ -267,7 +267,7 @@ def of_repeats(record: Record) -> Record:
         raise InputError(f"--truth repeats: {record.name} needs estimates of 2 runs or more, with covariances")
     error = np.full(record.errors.error[1:].shape, np.nan)
     covariance = np.full(record.errors.covariance[1:].shape, np.nan)
-    counted = np.isfinite(record.errors.error).all(axis=-1) & every_entry(np.isfinite, record.errors.covariance)
+    counted: Array = np.isfinite(record.errors.error).all(axis=-1) & every_entry(np.isfinite, record.errors.covariance)
     if record.errors.nees is not None:  # a covariance that is singular, or not positive definite, is of no use
         counted &= np.isfinite(record.errors.nees)
     mean = np.where(counted[0, :, None], record.errors.error[0], 0.0)

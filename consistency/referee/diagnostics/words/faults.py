@@ -109,6 +109,8 @@ def scale_text(v: Findings) -> str:
 def _size_and_note(v: Findings, inflation: Interval) -> tuple[str, str]:
     """The size of the fault, and what is to be known of runs that differ much."""
     size = off_by(inflation)
+    if inflation.high == float("inf"):  # more than numbers of few members show
+        return size, ""
     if v.runs > 1 and inflation.value > TINY and is_uncertain(inflation):
         if inflation.low <= 1.0:
             size = off_by_factor(inflation.value)

@@ -51,8 +51,6 @@ KINDS = (
     "errors and covariances, or bounds in place of covariances; or estimates, truth and covariances; or members and "
     "truth; or nees and dof"
 )
-
-
 UNWEIGHTED = (
     "ranks among weighted members are not uniform (3 % of those of a right filter lie beyond its 1 %); draw members of "
     "equal weight from all particles, far fewer than are effective, and give these"
@@ -124,9 +122,10 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     if kind == OF_MEMBERS:
         return _of_members(archive, r)
     if kind == OF_REPEATS:
-        repeats = archive.array("estimates", 3)
-        first = np.take_along_axis(repeats, np.argmax(np.isfinite(repeats), axis=0)[None], axis=0)  # any would do
-        archive = Archive(path, {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, repeats.shape))})
+        states = archive.array("estimates", 3)
+        first = np.take_along_axis(states, np.argmax(np.isfinite(states), axis=0)[None], axis=0)  # any value would do
+        arrays = {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, states.shape))}
+        archive = Archive(path, arrays)
     if kind != OF_NEES:
         require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
     if kind == OF_ERRORS:
@@ -243,12 +242,11 @@ def _of_members(archive: Archive, r: Reading) -> Estimator:
         beside = f"needs {(runs, steps, n)} beside 'members' {members.shape}, (runs, steps, m, n)"
         raise InputError(f"{path}: key 'truth' has shape {truth.shape}, {beside}")
     there = archive.known(runs, steps)
-    flat = checked_members(
-        members.reshape(-1, m, n),
-        there.ravel(),
-        lambda k: f"{path}: key 'members', run {k // steps}, step {k % steps + 1}",
-    )
-    means = flat.mean(axis=1).reshape(truth.shape)
+
+    def place(k: int) -> str:
+        return f"{path}: key 'members', run {k // steps}, step {k % steps + 1}"
+
+    means = checked_members(members.reshape(-1, m, n), there.ravel(), place).mean(axis=1).reshape(truth.shape)
     by = archive.groups(r, (runs, steps))
     poses = []
     for one in _runs(archive, means, _finite_truth(path, means, truth, there), there):

@@ -10,7 +10,6 @@ import numpy as np
 from consistency.referee.diagnostics.statistics.normal_numbers import SEED, TOGETHER, is_joint
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.columns import clock_of
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import ALONE, Estimator
@@ -25,7 +24,7 @@ def checked_members(members: Array, known: Array, place: Callable[[int], str]) -
     InputError
         Some members of a step that is ``known`` (k,) are not finite, and others are.
     """
-    finite = np.isfinite(members).all(axis=-1)
+    finite: Array = np.asarray(np.isfinite(members).all(axis=-1))
     partly = np.flatnonzero(known & finite.any(axis=-1) & ~finite.all(axis=-1))
     if len(partly):
         row = int(partly[0])
@@ -115,11 +114,6 @@ def beside_first_run(sheet: TableRows, axes: Sequence[str]) -> tuple[TableRows, 
     if "run" not in data:
         data["run"] = np.arange(float(len(sheet)))
         data["step"] = np.ones(len(sheet))
-    elif "step" not in data and clock_of(list(data)) is None:
-        order = np.argsort(data["run"], kind="stable")
-        _, starts, counts = np.unique(np.asarray(data["run"])[order], return_index=True, return_counts=True)
-        data["step"] = np.empty(len(sheet))
-        data["step"][order] = np.arange(len(sheet)) - np.repeat(starts, counts) + 1.0
     sheet = replace(sheet, data=data)
     runs = sheet.numbers("run", whole=True)
     keys = {key: data[key] for key in ("step", "t", *axes) if key in data}

@@ -47,14 +47,15 @@ def record_of_arrays(
         finite in any run.
     """
     first = next(iter(given))
-    reading = replace(reading or Reading(), independent=independent or None)
+    are_repeats = first == "estimates"
+    reading = replace(reading or Reading(), independent=(independent and not are_repeats) or None)
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
         if arrays[first].ndim == 3 and first == "errors":  # of runs whose steps are independent, too
             arrays = {key: array.reshape(-1, *array.shape[2:]) for key, array in arrays.items()}
         if first != "members":  # whose shapes are compared below
             _require_rows(first, {key: array.shape for key, array in arrays.items()})
-        arrays = {key: array[None] for key, array in arrays.items()}
+        arrays = {key: np.expand_dims(array, 1 if are_repeats else 0) for key, array in arrays.items()}
     if first in ("errors", "estimates") and "covariances" in arrays:
         require_layout(first, arrays[first].shape, arrays["covariances"].shape)
     shape = arrays[first].shape
@@ -74,7 +75,7 @@ def record_of_arrays(
                 "cs.judge, says that each row is a run of its own, which the steps of a log are not"
             )
         raise InputError(text)
-    if first == "estimates":
+    if are_repeats:
         own = arrays.pop(first)
         begin = np.take_along_axis(own, np.argmax(np.isfinite(own), axis=0)[None], axis=0)
         arrays = {"errors": begin - own, **arrays}  # from any one value: what all share is lost
@@ -104,15 +105,15 @@ def record_of_arrays(
         record = estimator_of_arrays(Path("arrays"), arrays, reading)
         if isinstance(record, Estimator):
             (record,) = records_of(record, reading)
-        if reading.ensemble is not None or first == "estimates":
+        if sigma is not None and not record.errors.bounds:
+            record = each_alone(record)
+        if reading.ensemble is not None or are_repeats:
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
 
-            record = of_repeats(record) if first == "estimates" else record
+            record = of_repeats(record) if are_repeats else record
             record = record if reading.ensemble is None else of_ensemble(record, reading.ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
-    if sigma is not None and not record.errors.bounds:
-        record = each_alone(record)
     failures = tuple(replace(failure, filter=name) for failure in record.failures)
     return replace(record, name=require_name(name, "name"), failures=failures)
 

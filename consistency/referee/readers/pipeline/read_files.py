@@ -47,18 +47,14 @@ NO_GUESS = {
 OF_TRAJECTORIES = ("covariance", "covariance_order", "axes", "lever_arm")  # options
 OF_BAGS = ("topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
-OF_TABLES = ("dof", "members")
+OF_STATES = ("state", "dof", "members")
 OF_NAMES = ("columns", "truth_columns")
 OF_BOUNDS = ("level", "gaussian", "ends")
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
-OF_OTHERS_THAN_ARCHIVES = (*OF_NAMES, *OF_AXES, *OF_BAGS, "state", *OF_TABLES, *OF_TRAJECTORIES, *OF_TRUTH_FILES)
-ARCHIVE_KEYS = {
-    "truth": "truth",
-    "members": "members",
-    "axes": "axes",
-    "truth_covariance": "truth_covariances",
-}  # in place of options
+OF_OTHERS_THAN_ARCHIVES = (*OF_NAMES, *OF_AXES, *OF_BAGS, *OF_STATES, *OF_TRAJECTORIES, *OF_TRUTH_FILES)
+# in place of options
+ARCHIVE_KEYS = {"truth": "truth", "axes": "axes", "truth_covariance": "truth_covariances", "members": "members"}
 PROGRAM_RUNS = "monte-carlo"  # kind of the manifest of a folder with runs of a program
 Found = Sequence[Estimator | Record]
 
@@ -141,11 +137,11 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 
 KINDS = (  # a file is of the first that knows it
     Kind("runs of a program", lambda path, r: is_program_runs(path), (), _program_runs),
-    Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_TABLES, *OF_BOUNDS), _bags),
+    Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_STATES, *OF_BOUNDS), _bags),
     Kind("archive of arrays", _is_archive, OF_OTHERS_THAN_ARCHIVES, _archive),
     Kind("table", _is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind("folder of tables", _is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
-    Kind("trajectory", _is_trajectory, (*OF_BAGS, *OF_BOUNDS, "state", *OF_TABLES), _trajectories),
+    Kind("trajectory", _is_trajectory, (*OF_BAGS, *OF_BOUNDS, *OF_STATES), _trajectories),
 )
 
 
@@ -417,9 +413,8 @@ def checked_options(r: Reading) -> Reading:
         require_truth_options(r)
     if r.repeats:
         why = ": repeats have no truth, and each run is compared with those before"
-        r.refuse(
-            "--truth repeats", dict.fromkeys((*OF_WINDOWS, *OF_TRUTH, *GROUPED, "align", "split", "time_offset"), why)
-        )
+        of_truth = (*OF_WINDOWS, *OF_TRUTH, *GROUPED, "align", "split", "time_offset")
+        r.refuse("--truth repeats", dict.fromkeys(of_truth, why))
     if r.ensemble is not None and r.given(OF_TRUTH):
         raise InputError(f"--ensemble: does not go with {flag_of(r.given(OF_TRUTH)[0])}, of a Gaussian error")
     if r.given(OF_BOUNDS):

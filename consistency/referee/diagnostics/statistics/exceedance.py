@@ -40,7 +40,8 @@ def betting(shares: Array, a: float) -> Array:
     shares : (..., runs), in [0, 1]
     """
     logs = np.stack([np.log1p(bet / a * (shares - a)).sum(axis=-1) for bet in BETS])
-    return np.minimum(1.0, np.exp(-(special.logsumexp(logs, axis=0) - np.log(len(BETS)))))
+    wealth = special.logsumexp(logs, axis=0) - np.log(len(BETS))
+    return np.asarray(np.minimum(1.0, np.exp(-wealth)))
 
 
 def gaffke(shares: Array, a: float) -> Array:
@@ -103,7 +104,7 @@ class Exceedance:
 
     @cached_property
     def _counts(self) -> Array:
-        return np.isfinite(self.ratios).sum(axis=1) + np.isposinf(self.ratios).sum(axis=1)
+        return np.asarray((~np.isnan(self.ratios)).sum(axis=1))
 
     @property
     def runs(self) -> int:

@@ -39,9 +39,7 @@ FEWEST = 10  # runs and steps from which on swapped arrays are looked for
 ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
 ALIKE = 0.5  # correlation from run to run
 UNLIKE = 0.2  # of it, from step to step
-KINDS = (
-    "errors and covariances, or bounds in place of covariances; or estimates, truth and covariances; or nees and dof"
-)
+KINDS = "errors and covariances; or errors and bounds; or estimates, truth and covariances; or nees and dof"
 
 
 HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read

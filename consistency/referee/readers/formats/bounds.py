@@ -223,10 +223,10 @@ def _stated(
     bounds = []
     for (name, components), level in zip(named, of, strict=True):
         bounds.append(Bound(name, components, level.of(len(components)), r.ends == ENDS))
-    index = tuple(tuple(map(list(axes).index, components)) for _, components in named)
-    deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, index, strict=True))
-    stated = Bounds(tuple(bounds), index, deviations, bool(r.gaussian))
-    twice = [axes[i] for i in set(sum(index, ())) if sum(index, ()).count(i) > 1]
+    places = tuple(tuple(map(list(axes).index, components)) for _, components in named)
+    deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, places, strict=True))
+    stated = Bounds(tuple(bounds), places, deviations, bool(r.gaussian))
+    twice = [axes[i] for i in set(sum(places, ())) if sum(places, ()).count(i) > 1]
     if stated.gaussian and twice:
         raise InputError(f"--gaussian: {twice[0]} has several bounds; leave all but one of them out")
     return stated
@@ -293,7 +293,7 @@ def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
     Where they do not stand for one, the matrices say which rows state a bound: NaN where one is NaN.
     """
     variances = np.ones((len(values), n))
-    for k, (index, deviations) in enumerate(zip(stated.index, stated.deviations, strict=True)):
+    for k, (index, deviations) in enumerate(zip(stated.places, stated.deviations, strict=True)):
         sigma = values[:, k].mean(axis=-1) / deviations
         if not stated.gaussian:
             sigma = np.where(np.isnan(sigma), np.nan, 1.0)
@@ -304,7 +304,7 @@ def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
 def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
     """Errors (N, n) over their bounds (N, bounds, 2), with the sign of single components, (N, bounds)."""
     out = np.empty(values.shape[:2])
-    for k, index in enumerate(stated.index):
+    for k, index in enumerate(stated.places):
         e = errors[:, index[0]] if len(index) == 1 else np.linalg.norm(errors[:, list(index)], axis=1)
         size = np.where(e < 0.0, values[:, k, 0], values[:, k, 1])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -319,7 +319,7 @@ def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:
     assert stated is not None
     if stated.gaussian:
         places = {list(e.axes).index(axis): i for i, axis in enumerate(record.axes)}
-        parts = tuple(tuple(places[i] for i in index) for index in stated.index)
+        parts = tuple(tuple(places[i] for i in index) for index in stated.places)
         note = f"{e.said}: bounds are read as those of a Gaussian at --level {level_text}"
         return replace(record, parts=parts if len(parts) > 1 else (), notes=(*record.notes, note))
     failures = tuple(replace(f, reason=f.reason.replace("covariance", "bound")) for f in record.failures)

@@ -154,6 +154,7 @@ def test_a_verdict_names_the_factor_of_the_bound(size, status):
     assert score.factor.high >= size * 0.95
     assert_allclose(score.factor.value, size, rtol=0.06)
     assert f"{score.factor.value:.2f} [" in verdict.reasons[0]
+    assert_allclose(score.equivalence.factor, 1.5**0.5)
     assert verdict.consistent == (status == "consistent")
     assert (verdict.p_value <= 0.05) == (status != "consistent")
 

@@ -534,9 +534,8 @@ def level_causes(found: Findings) -> list[str]:
     words = " or ".join(LEVELS[of] for of in fitting)
     factors = " or ".join(f"{of:g}" for of in fitting)
     options = " or ".join(f"--level {DECLARED[of]} --gaussian" for of in fitting)
-    return [
-        f"perhaps a matter of what is stated: a covariance that is {factors} times too large would fit {words}; declared by {options}"
-    ]
+    text = f"a covariance that is {factors} times too large would fit {words}; declared by {options}"
+    return [f"perhaps a matter of what is stated: {text}"]
 
 
 def groups_text(by: ByGroup, is_fault: bool) -> str:

@@ -406,6 +406,7 @@ def test_levels_are_read(text, share, dimensions):
     assert_allclose(level.of(dimensions), share, rtol=1e-4)
     assert_allclose(level_of(level.in_deviations(dimensions), dimensions), share, rtol=1e-4)
     assert Levels(f"a={text},b=1%").of("a") == level
+    assert_allclose(level_of_text("2sigma").of(2), 0.8647, rtol=1e-4)
 
 
 def test_names_of_components_may_hold_underscores():

@@ -295,7 +295,7 @@ def _judged(
 
     def needed(rate: float) -> int:
         if record.errors.bounds:
-            return bound_gate_runs(record, replace(demand, false_alarm=rate))
+            return bound_gate_runs(record, demand)
         return gate_runs(
             planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
         )

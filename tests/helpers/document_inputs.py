@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 from documents import ROOT
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -45,6 +46,8 @@ NOT_RUN = [
     ("docs/files.md", "consistency analyse keyframes.csv", "tests/unit/referee/test_relative.py has cross-covariances"),
     ("docs/files.md", "consistency analyse est.tum", "tests/oracle/test_gtsam_windows.py has such marginals"),
     ("docs/files.md", "joint = marginals", "tests/oracle/test_gtsam_windows.py does the same"),
+    ("docs/what-can-be-stated.md", "python docs/examples", "needs data of another package, and pyreadr"),
+    ("docs/what-can-be-stated.md", "consistency analyse hub.csv", "needs data of another package"),
     ("docs/what-to-state.md", "python docs/examples", "needs a real drive"),
     ("docs/what-to-state.md", "consistency fit-covariance", "needs real drives; test_fit_command.py simulates"),
     ("docs/what-to-state.md", "consistency correct", "needs real drives; test_correct_command.py simulates"),
@@ -149,6 +152,14 @@ def ensembles(folder):
     np.savez(folder / "ensemble.npz", errors=truth - mean[:, :, 0], covariances=P)
     variances = dict.fromkeys(("P_xx", "P_yy", "P_zz"), 1.0) | dict.fromkeys(("P_xy", "P_xz", "P_yz"), 0.0)
     table(folder / "repeats.csv", [dict(zip("xyz", RNG.normal(size=3), strict=True)) | variances for _ in range(20)])
+
+
+def receiver(folder):
+    """receiver.csv with accuracies, and truth.csv: x, y, z of 80 runs."""
+    keys = [{"run": run, "step": step} for run in range(80) for step in range(1, 11)]
+    own = [key | dict(zip("xyz", RNG.normal(size=3), strict=True)) | {"h_acc": 1.1, "v_acc": 2.0} for key in keys]
+    table(folder / "receiver.csv", own)
+    table(folder / "truth.csv", [key | dict.fromkeys("xyz", 0.0) for key in keys])
 
 
 def grouped(folder):
@@ -316,7 +327,7 @@ PREPARE = {
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],
-    "docs/what-can-be-stated.md": [ensembles],
+    "docs/what-can-be-stated.md": [ensembles, receiver],
 }  # of a page, or of a part of it that has a folder of its own
 
 # --- names that the reader brings --------------------------------------------------------------------------
@@ -359,6 +370,16 @@ def names_of(page, folder):
         return {"paths": [folder / f"IMAGES/image_{side}/00000{k}.png" for k in (0, 1) for side in (0, 1)]}
     if page == "README.md":
         return {"errors": RNG.normal(size=(60, 20, 3)), "covariances": np.broadcast_to(np.eye(3), (60, 20, 3, 3))}
+    if page == "docs/what-can-be-stated.md":
+        from consistency.testing import assert_consistent
+
+        errors_of_runs = stats.norm.ppf(RNG.permutation((np.arange(16000) + 0.5) / 16000)).reshape(400, 20, 2)
+        return {
+            "cs": cs,
+            "errors": errors_of_runs,
+            "radii": np.full((400, 20), 2.448),
+            "assert_consistent": assert_consistent,
+        }
     if page == "docs/groups.md":
         covariances = np.broadcast_to(np.eye(3), (60, 20, 3, 3))
         errors_of_runs = RNG.normal(size=(60, 20, 3))

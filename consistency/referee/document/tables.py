@@ -113,21 +113,15 @@ def factor(v: Verdict) -> Quantity:
 
 
 def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
-    """Ratio of true to stated covariance: of the axis that decides, with its name, or of the whole; of bounds their
-    factor."""
+    """Ratio of true to stated covariance: of the axis that decides with its name, or of the whole; factor of bounds."""
     if v.bounds:
-        return _factor_of_bound(v)
+        from consistency.referee.diagnostics.words.bounds import deciding, factor_text
+
+        one = deciding(v.bounds)
+        return f"{factor_text(one.factor)} x {one.name}"
     if v.status == "biased" and v.bias is not None and v.bias.inflation_without is not None:
         return f"{ratio_text(v.bias.inflation_without)} about the mean"
     return whole if v.axis is None else f"{ratio_text(v.axis[1])} in {v.axis[0]}"
-
-
-def _factor_of_bound(v: Verdict) -> str:
-    """Factor of the bound at fault that is clearest, or of the one that is farthest from right."""
-    from consistency.referee.diagnostics.words.bounds import deciding, factor_text
-
-    one = deciding(v.bounds)
-    return f"{factor_text(one.factor)} x {one.name}"
 
 
 def shown_inside(v: Verdict) -> Cell:

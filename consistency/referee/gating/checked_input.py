@@ -101,10 +101,9 @@ def record_of_checked(
 
 def bound_gate_runs(record: Record, terms: Terms) -> int:
     """Runs with which a gate passes right bounds, however steps depend on each other; a million at most."""
-    from consistency.referee.diagnostics.statistics.exceedance import LARGEST, bound_runs
+    from consistency.referee.diagnostics.statistics.exceedance import LARGEST, runs_to_show
 
-    each = [bound_runs(bound.level, terms.detect, terms.false_alarm, terms.power) for bound in record.errors.bounds]
-    return max(one.consistent or LARGEST for one in each)
+    return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
 
 
 def planned_dof(record: Record) -> int:

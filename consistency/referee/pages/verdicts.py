@@ -68,15 +68,11 @@ def judgement(study: Judged) -> list[Block]:
     return blocks
 
 
+SHARES = ("Inside (%)", "Above (%)", "Below (%)", "Excluded outside (%)")
 BOUNDS = (
     Column("Bound", width="2fr"),
     Column("Verdict"),
-    Column("Level", number=True),
-    Column("Inside (%)", number=True),
-    Column("Above (%)", number=True),
-    Column("Below (%)", number=True),
-    Column("Rate outside that is excluded (%)", "Excluded\noutside (%)", number=True),
-    Column("Factor by which it must grow", "Factor", number=True),
+    *(Column(head, number=True) for head in ("Level", *SHARES, "Factor it must grow by")),
 )
 
 

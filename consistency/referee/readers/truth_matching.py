@@ -370,7 +370,7 @@ class Bounds(NamedTuple):
     """Bounds on components of the error, which an estimator states in place of a covariance."""
 
     bounds: tuple[Bound, ...]
-    index: tuple[tuple[int, ...], ...]  # of each its components, by their places in the error
+    places: tuple[tuple[int, ...], ...]  # of each its components, by their places in the error
     deviations: tuple[float, ...]  # of each how many standard deviations of a Gaussian it has at its level
     gaussian: bool  # declared: they stand for the covariance of one
 

@@ -209,18 +209,7 @@ def plan(
 
 
 def plan_of_bounds(level: str | float, detect: float, false_alarm: float, power: float) -> dict[str, Any]:
-    """Runs that bounds of a ``level`` take, however steps depend on each other.
-
-    Returns
-    -------
-    The options, with ``fewest``, ``consistent``, ``small`` and ``large`` of
-    :class:`~consistency.referee.diagnostics.statistics.exceedance.BoundRuns`
-
-    Raises
-    ------
-    InputError
-        A number out of its range.
-    """
+    """Runs that bounds of a ``level`` take, by what they show; raises InputError for a number out of its range."""
     from consistency.referee.diagnostics.statistics.exceedance import bound_runs
     from consistency.referee.readers.formats.bounds import level_of_text
 

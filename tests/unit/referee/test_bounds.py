@@ -154,6 +154,7 @@ def test_a_verdict_names_the_factor_of_the_bound(size, status):
     assert score.factor.high >= size * 0.95
     assert_allclose(score.factor.value, size, rtol=0.06)
     assert f"{score.factor.value:.2f} [" in verdict.reasons[0]
+    assert_allclose(score.equivalence.factor, 1.5**0.5)
     assert verdict.consistent == (status == "consistent")
     assert (verdict.p_value <= 0.05) == (status != "consistent")
 
@@ -405,6 +406,7 @@ def test_levels_are_read(text, share, dimensions):
     assert_allclose(level.of(dimensions), share, rtol=1e-4)
     assert_allclose(level_of(level.in_deviations(dimensions), dimensions), share, rtol=1e-4)
     assert Levels(f"a={text},b=1%").of("a") == level
+    assert_allclose(level_of_text("2sigma").of(2), 0.8647, rtol=1e-4)
 
 
 def test_names_of_components_may_hold_underscores():

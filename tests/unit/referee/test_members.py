@@ -238,7 +238,7 @@ def test_deviations_of_members_are_mapped_one_by_one():
     record = cs.judge(e, deviations=sigma, ensemble=6).record
     expected = stats.norm.ppf(stats.t.cdf(e / sigma / np.sqrt(1 + 1 / 6), 5))
     np.testing.assert_allclose(record.errors.error, expected, rtol=1e-6)
-    assert record.parts == ((0,), (1,), (2,))
+    assert record.errors.parts == ((0,), (1,), (2,))
 
 
 def test_a_run_without_members_from_a_step_on_has_failed():

@@ -30,30 +30,23 @@ Test = Callable[[Array, float], Array]
 
 
 def betting(shares: Array, a: float) -> Array:
-    """p value of an expected share of at most ``a``, by a bet against it (Waudby-Smith & Ramdas 2024, sec. 4).
+    """p value of an expected share of at most ``a``, of shares (..., runs), by a bet (Waudby-Smith & Ramdas 2024).
 
     The mean over constant bets of the product of 1 + bet (share - a) is a test martingale, so that the inverse of its
     last value is a p value for any law of the shares (Markov).
-
-    Parameters
-    ----------
-    shares : (..., runs), in [0, 1]
     """
     logs = np.stack([np.log1p(bet / a * (shares - a)).sum(axis=-1) for bet in BETS])
-    return np.minimum(1.0, np.exp(-(special.logsumexp(logs, axis=0) - np.log(len(BETS)))))
+    wealth = special.logsumexp(logs, axis=0) - np.log(len(BETS))
+    return np.asarray(np.minimum(1.0, np.exp(-wealth)))
 
 
 def gaffke(shares: Array, a: float) -> Array:
-    """p value of an expected share of at most ``a`` by Gaffke's test.
+    """p value of an expected share of at most ``a`` of shares (..., runs), by Gaffke's test.
 
     Gaffke (2005), Three test statistics for a nonparametric one-sided hypothesis on the mean of a nonnegative variable.
     It is the probability that a mean of the shares and a zero, with weights that are uniform on the simplex, is at most
     ``a``. Shares of 0 and 1 alone give the exact binomial p value. For other laws no proof is known; docs/reference/
     rates.md has the measured rates.
-
-    Parameters
-    ----------
-    shares : (..., runs), in [0, 1]
     """
     ones = (shares == 1.0).sum(axis=-1)
     are_whole = ((shares == 0.0) | (shares == 1.0)).all(axis=-1)
@@ -103,7 +96,7 @@ class Exceedance:
 
     @cached_property
     def _counts(self) -> Array:
-        return np.isfinite(self.ratios).sum(axis=1) + np.isposinf(self.ratios).sum(axis=1)
+        return np.asarray((~np.isnan(self.ratios)).sum(axis=1))
 
     @property
     def runs(self) -> int:
@@ -192,7 +185,7 @@ class BoundRuns(NamedTuple):
 
     fewest: int  # below, neither consistent nor conservative can be reached
     consistent: int | None  # a right bound is shown to be right
-    small: int | None  # a bound too small by the root of ``detect`` is found
+    small: int | None  # a bound too small by ``detect`` is found
     large: int | None  # a bound too large by it is found
 
 
@@ -202,20 +195,15 @@ def fewest_runs(level: float, tail: float = 1.0 - CONFIDENCE) -> int:
 
 
 def bound_runs(
-    level: float, detect: float = DETECT, false_alarm: float = FALSE_ALARM, power: float = POWER,
-    find: float | None = None,
-) -> BoundRuns:  # fmt: skip
+    level: float, detect: float = DETECT, false_alarm: float = FALSE_ALARM, power: float = POWER
+) -> BoundRuns:
     """Runs of Gaussian errors with which a verdict on a bound of this level decides with ``power``.
 
-    In the worst case all steps of a run are alike, and the number of runs outside is binomial.
-
-    Parameters
-    ----------
-    detect : ratio of covariances; *consistent* is a factor of the bound within its root
-    find : factor by which a bound is too small or too large that is to be found; ``detect`` if not given
+    In the worst case all steps of a run are alike, and the number of runs outside is binomial. Shown to be right is a
+    factor of the bound within the root of ``detect``; found is a bound that is wrong by the factor ``detect``.
     """
     a = 1.0 - level
-    wrong = max(detect, 1.0 / detect) if find is None else find
+    wrong = max(detect, 1.0 / detect)
     side = false_alarm / 2.0
     return BoundRuns(
         fewest_runs(level, 1.0 - power),

@@ -68,6 +68,7 @@ LEVELS = {
     4.0: "deviations of 2 sigma",
     CEP: "a CEP in place of deviations (the radius of 50 % in the plane, 1.1774 sigma)",
 }  # by the factor on a variance, the squares of these multiples
+DECLARED = {3.84: "95%", 4.0: "2sigma", CEP: "CEP"}  # by --level
 MUCH = 100_000  # runs; more are no advice
 
 # --- the scale ---------------------------------------------------------------------------------------
@@ -534,7 +535,9 @@ def level_causes(found: Findings) -> list[str]:
         return []
     words = " or ".join(LEVELS[of] for of in fitting)
     factors = " or ".join(f"{of:g}" for of in fitting)
-    return [f"perhaps a matter of what is stated: a covariance that is {factors} times too large would fit {words}"]
+    options = " or ".join(f"--level {DECLARED[of]} --gaussian" for of in fitting)
+    text = f"a covariance that is {factors} times too large would fit {words}; declared by {options}"
+    return [f"perhaps a matter of what is stated: {text}"]
 
 
 def groups_text(by: ByGroup, is_fault: bool) -> str:

@@ -48,8 +48,8 @@ ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are i
 ALIKE = 0.5  # correlation from run to run
 UNLIKE = 0.2  # of it, from step to step
 KINDS = (
-    "errors and covariances, or bounds in place of covariances; or estimates, truth and covariances; or members and "
-    "truth; or nees and dof"
+    "errors and covariances; or errors and bounds; or estimates, truth and covariances; or members and truth; or nees "
+    "and dof"
 )
 UNWEIGHTED = (
     "ranks among weighted members are not uniform (3 % of those of a right filter lie beyond its 1 %); draw members of "

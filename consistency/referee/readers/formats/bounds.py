@@ -17,7 +17,7 @@ from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.records.record import Bound, Record
 from consistency.referee.diagnostics.statistics.exceedance import deviations_of, level_of
 from consistency.referee.errors import InputError
-from consistency.referee.readers.formats.columns import plain_name, require_units
+from consistency.referee.readers.formats.columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.places import refuse
@@ -55,26 +55,19 @@ class Level(NamedTuple):
 
 
 def level_of_text(given: Any) -> Level:
-    """A level of an option or argument: 95%, 0.95, 2sigma, CEP.
-
-    Raises
-    ------
-    InputError
-        It is none, or has no level.
-    """
+    """A level of an option or argument: 95%, 0.95, 2sigma, CEP; raises InputError for what is none."""
     text = str(given).strip()
     word = text.lower().replace(" ", "")
     if word in ("2drms", "drms"):
         raise InputError(f"--level {text}: {TRACE}")
     if word in WORDS:
-        return Level(text, *WORDS[word][:1], None, WORDS[word][1])
+        return Level(text, WORDS[word][0], dimensions=WORDS[word][1])
     found = re.fullmatch(r"(\d+\.?\d*(?:e-?\d+)?|\.\d+)(%|sigma|)", word)
     value = float(found[1]) / (100.0 if found[2] == "%" else 1.0) if found else 0.0
-    if found and found[2] == "sigma" and 0.0 < value < 10.0:
-        return Level(text, None, value)
-    if not found or found[2] == "sigma" or not 0.0 < value < 1.0:
+    is_sigma = found is not None and found[2] == "sigma"
+    if not 0.0 < value < (10.0 if is_sigma else 1.0):
         raise InputError(f"--level {text}: {FORMS}")
-    return Level(text, value)
+    return Level(text, None, value) if is_sigma else Level(text, value)
 
 
 class Levels:
@@ -145,14 +138,11 @@ def bound_columns(names: Sequence[str]) -> list[BoundColumns]:
 
 def _components(text: str, names: Sequence[str]) -> tuple[str, ...]:
     """Components that a text such as ``x_y`` joins: names of columns where such are there."""
-    for end in range(len(text), 0, -1):
-        first, rest = text[:end], text[end + 1 :]
-        is_name = first in names or f"true_{first}" in names
-        if is_name and not rest and end == len(text):
-            return (first,)
-        if is_name and text[end : end + 1] == "_" and rest:
-            return first, *_components(rest, names)
-    return tuple(text.split("_"))
+    known = {*names, *(name.removeprefix("true_") for name in names)}
+    for end in range(1, len(text)):
+        if text[end] == "_" and text[:end] in known:
+            return text[:end], *_components(text[end + 1 :], names)
+    return (text,) if text in known else tuple(text.split("_"))
 
 
 def state_of_bounds(names: Sequence[str]) -> list[str]:
@@ -166,10 +156,9 @@ def state_of_bounds(names: Sequence[str]) -> list[str]:
 def with_centres(sheet: TableRows) -> TableRows:
     """The table with the middle of each interval as its estimate, where the component has no column."""
     data = dict(sheet.data)
-    plain = {plain_name(name) for name in data}
     for one in bound_columns(list(data)):
         (component, *_), (low, *high) = one.components, one.columns
-        if high and component not in plain and not {f"{component}_est", f"est_{component}"} & plain:
+        if high and component not in data:
             data[component] = 0.5 * (sheet.numbers(low) + sheet.numbers(high[0]))
     return replace(sheet, data=data)
 
@@ -223,10 +212,10 @@ def _stated(
     bounds = []
     for (name, components), level in zip(named, of, strict=True):
         bounds.append(Bound(name, components, level.of(len(components)), r.ends == ENDS))
-    index = tuple(tuple(map(list(axes).index, components)) for _, components in named)
-    deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, index, strict=True))
-    stated = Bounds(tuple(bounds), index, deviations, bool(r.gaussian))
-    twice = [axes[i] for i in set(sum(index, ())) if sum(index, ()).count(i) > 1]
+    places = tuple(tuple(map(list(axes).index, components)) for _, components in named)
+    deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, places, strict=True))
+    stated = Bounds(tuple(bounds), places, deviations, bool(r.gaussian))
+    twice = [axes[i] for i in set(sum(places, ())) if sum(places, ()).count(i) > 1]
     if stated.gaussian and twice:
         raise InputError(f"--gaussian: {twice[0]} has several bounds; leave all but one of them out")
     return stated
@@ -293,7 +282,7 @@ def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
     Where they do not stand for one, the matrices say which rows state a bound: NaN where one is NaN.
     """
     variances = np.ones((len(values), n))
-    for k, (index, deviations) in enumerate(zip(stated.index, stated.deviations, strict=True)):
+    for k, (index, deviations) in enumerate(zip(stated.places, stated.deviations, strict=True)):
         sigma = values[:, k].mean(axis=-1) / deviations
         if not stated.gaussian:
             sigma = np.where(np.isnan(sigma), np.nan, 1.0)
@@ -304,12 +293,11 @@ def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
 def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
     """Errors (N, n) over their bounds (N, bounds, 2), with the sign of single components, (N, bounds)."""
     out = np.empty(values.shape[:2])
-    for k, index in enumerate(stated.index):
+    for k, index in enumerate(stated.places):
         e = errors[:, index[0]] if len(index) == 1 else np.linalg.norm(errors[:, list(index)], axis=1)
         size = np.where(e < 0.0, values[:, k, 0], values[:, k, 1])
         with np.errstate(divide="ignore", invalid="ignore"):
-            out[:, k] = np.where(e == 0.0, 0.0 * size, e / size)
-        out[:, k] = np.where((e == 0.0) & np.isinf(size), 0.0, out[:, k])
+            out[:, k] = np.where((e == 0.0) & ~np.isnan(size), 0.0, e / size)
     return out
 
 
@@ -319,7 +307,7 @@ def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:
     assert stated is not None
     if stated.gaussian:
         places = {list(e.axes).index(axis): i for i, axis in enumerate(record.errors.axes)}
-        parts = tuple(tuple(places[i] for i in index) for index in stated.index)
+        parts = tuple(tuple(places[i] for i in index) for index in stated.places)
         note = f"{e.said}: bounds are read as those of a Gaussian at --level {level_text}"
         errors = replace(record.errors, parts=parts if len(parts) > 1 else ())
         return replace(record, errors=errors).with_notes(note)

@@ -333,7 +333,7 @@ def _estimator(
             has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
     definition = PLANAR[convention]
-    judged = None if bounds is None else sorted(set(sum(bounds.index, ())))
+    judged = None if bounds is None else sorted(set(sum(bounds.places, ())))
     found = Estimator(
         name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,
         position=_position(axes), bounds=bounds,

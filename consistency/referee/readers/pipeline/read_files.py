@@ -117,7 +117,8 @@ def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 
 def _is_table_folder(path: Path, r: Reading) -> bool:
-    return path.is_dir() and bool(table_files(path)) and (r.state is not None or not trajectory_files(path, r.columns))
+    named = r.state is not None or r.level is not None
+    return path.is_dir() and bool(table_files(path)) and (named or not trajectory_files(path, r.columns))
 
 
 def _is_archive(path: Path, r: Reading) -> bool:

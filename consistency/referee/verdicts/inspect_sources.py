@@ -44,7 +44,7 @@ QUALITY = re.compile(
     r"rate|weather|light|scene|sensor).*",
     re.IGNORECASE,
 )  # names of columns for --by
-COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns that are no components of a state
+COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns beside the state
 ADVICE = re.compile(r"\badd (--[a-z-]+) ([^\s;()]+)")  # in a note of a reader
 OF_DRIVES = {"truth", "topic", "truth_topic", "columns", "truth_columns"}  # options of 'fit-covariance', too
 DEEPEST, MOST = 4, 4  # options that are added one after the other; candidates for one of them

@@ -9,10 +9,11 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = (
     "README.md",
     "docs/gates.md",
+    "docs/packaging/conda/meta.yaml",
     "docs/examples/repository/README.md",
     "docs/examples/repository/.github/workflows/consistency.yml",
 )
-REPOSITORY = re.compile(r"[\w.-]+/filter-consistency(?=$|[\s`/])", re.MULTILINE)  # OWNER/NAME, as in an address
+REPOSITORY = re.compile(r"[\w.-]+/filter-consistency(?=$|[\s`/\x22])", re.MULTILINE)  # OWNER/NAME, as in an address
 
 
 def repository() -> str:

@@ -310,7 +310,7 @@ class MarkedCommand(TyperCommand):
             with formatter.section(panel):
                 formatter.write_dl(records[panel])
         if hidden:
-            formatter.write(f"\n  {len(hidden)} more options, seldom needed: consistency {ctx.info_name} {HELP_ALL}\n")
+            formatter.write(f"\n  {len(hidden)} more options, rarely needed: consistency {ctx.info_name} {HELP_ALL}\n")
 
 
 def in_panels(parameters: Iterable[Any]) -> list[tuple[str, Any]]:

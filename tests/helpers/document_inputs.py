@@ -28,6 +28,8 @@ NOT_RUN = [
     ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
+    ("docs/coming-from.md", "", "test_inspect.py reads a trajectory with its truth beside it"),
+    ("docs/ros.md", "", "needs bags of a robot; test_inspect.py and test_bags.py write some"),
     ("docs/long-runs.md", "openssl", CLUSTER),
     ("docs/long-runs.md", "export", CLUSTER),
     ("docs/long-runs.md", "for role", CLUSTER),

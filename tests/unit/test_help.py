@@ -95,8 +95,8 @@ def test_options_that_few_need_are_shown_by_help_all(capsys):
     shown = [set(re.findall(r"^  (--[\w-]+)", text, re.MULTILINE)) for text in (short, whole)]
     seldom = {f"--{name.replace('_', '-')}" for name in SELDOM}
     assert shown[1] - shown[0] == seldom
-    assert f"{len(seldom)} more options, seldom needed: consistency analyse --help-all" in short
-    assert "seldom needed" not in whole
+    assert f"{len(seldom)} more options, rarely needed: consistency analyse --help-all" in short
+    assert "rarely needed" not in whole
     assert "--help-all" not in help_of(capsys, "list")
 
 

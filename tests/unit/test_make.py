@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,32 @@ def test_what_the_first_commands_of_the_readme_write_is_ignored_by_git():
     """The files of the example, the report, and what its pages name."""
     ignored = (ROOT / ".gitignore").read_text("utf-8").splitlines()
     assert {"/estimates.csv", "/truth.csv", "/look/"} <= set(ignored)
+
+
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def test_the_conda_recipe_has_what_the_project_has():
+    """Version, entry point, Python and the packages of the core, each with its floor."""
+    text = (ROOT / "docs/packaging/conda/meta.yaml").read_text("utf-8")
+    listed = set(re.findall(r"^    - (\S+) (>=\S+)$", text.partition("  run:\n")[2], re.MULTILINE))
+    needed = {re.fullmatch(r"([\w-]+)(>=\S+)", each).groups() for each in project()["dependencies"]}
+    assert listed == needed | {("python", project()["requires-python"])}
+    assert f'version = "{project()["version"]}"' in text
+    for name, target in project()["scripts"].items():
+        assert f"    - {name} = {target}\n" in text
+    assert project()["urls"]["Repository"] in text
+    assert "noarch: python" in text
+
+
+def test_the_container_ends_with_a_test_of_the_shipped_example():
+    """Its commands exist: the paths below the checkout, the extras, and the words of the program."""
+    text = (ROOT / "docs/packaging/Containerfile").read_text("utf-8")
+    for path in re.findall(r"/src/(docs/\S+)", text):
+        assert (ROOT / path).exists(), path
+    extras = re.search(r"/src\[(.*?)\]", text)[1].split(",")
+    assert set(extras) <= set(project()["optional-dependencies"])
+    *_, last = (step for step in text.split("\nRUN ") if step.strip())
+    assert "consistency analyse estimates.csv --truth truth.csv" in last
+    assert "--fail-on inconsistent" in last

@@ -173,8 +173,10 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
     """
     for name in options:
         if name not in (there := [each.name for each in fields(Reading)]):
-            raise InputError(f"{name}: is no option of files; there are: {', '.join(there)}")
-    given = {name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()}
+            raise InputError(f"{name}: is not an option of files; there are: {', '.join(there)}")
+    given: dict[str, Any] = {
+        name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()
+    }
     return inspect_file(Path(path), Reading(**given))
 
 

@@ -44,7 +44,7 @@ QUALITY = re.compile(
     r"rate|weather|light|scene|sensor).*",
     re.IGNORECASE,
 )  # names of columns for --by
-COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns that are no components of a state
+COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns beside the state
 ADVICE = re.compile(r"\badd (--[a-z-]+) ([^\s;()]+)")  # in a note of a reader
 OF_DRIVES = {"truth", "topic", "truth_topic", "columns", "truth_columns"}  # options of 'fit-covariance', too
 DEEPEST, MOST = 4, 4  # options that are added one after the other; candidates for one of them
@@ -219,7 +219,7 @@ def _topics(path: Path, r: Reading) -> Iterator[tuple[str, Any, str]]:
         there.sort(key=lambda one: (one.kind in FIX, not FILTERED.search(one.name)))
         for one in there[:MOST]:
             others = ", ".join(other.name for other in there if other is not one)
-            reason = "has poses with covariances, and its name is no truth's"
+            reason = "has poses with covariances, and is not called a truth"
             yield "topic", one.name, reason + (f"; {others} would do, too" if others else "")
     elif r.truth_topic is None:
         for one in topics:
@@ -274,7 +274,7 @@ def _advised(path: Path, tried: Attempt) -> Attempt:
         if advised is None or note.count("--") > 1 or "or if" in note or advised[1] not in options:
             continue
         name, parse = options[advised[1]].name, options[advised[1]].metadata["parse"]
-        value = advised[2] if parse is None else parse(advised[2])
+        value: Any = advised[2] if parse is None else parse(advised[2])
         why = {**tried.why, name: note.partition(": ")[2].partition("; ")[0]}
         if getattr(tried.reading, name) is None:
             again = _attempt(path, replace(tried.reading, **{name: value}), why)
@@ -333,7 +333,7 @@ def _innovations(path: Path, r: Reading, kind: str, facts: Pairs = (), choice: M
     extra = [word for name, value in choice.items() for word in (f"--{name}", str(value))]
     command = _command("monitor", path, Reading(columns=r.columns, dof=r.dof), (*extra, "--innovations", "optimal"))
     judged = log.dof > 0
-    dof = listed(np.unique(log.dof[judged]).astype(int))
+    dof = listed(np.unique(log.dof[judged]).astype(int).tolist())
     facts = (*facts, ("innovations", f"{judged.sum()}{_span(log.t)}, degrees of freedom {dof}"))
     why = (*((f"--{name}", "the first that is there") for name in choice), ("--innovations", OPTIMAL))
     return Inspection(path, f"{kind}, innovations", facts, log.notes, why, command)

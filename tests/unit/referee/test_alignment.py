@@ -618,7 +618,7 @@ def test_what_cannot_be_aligned_is_refused(options, words, tmp_path, rng):
 
 def test_there_must_be_a_truth_and_poses(tmp_path):
     np.savez(tmp_path / "errors.npz", errors=np.ones((2, 3, 1)), covariances=np.ones((2, 3, 1, 1)))
-    with pytest.raises(InputError, match="--align posyaw needs --truth"):
+    with pytest.raises(InputError, match="align=posyaw needs truth="):
         cs.read(tmp_path / "errors.npz", align="posyaw")
     with pytest.raises(InputError, match=r"does not go with"):
         cs.read(tmp_path / "errors.npz", truth=tmp_path / "errors.npz", align="posyaw")

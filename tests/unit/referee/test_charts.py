@@ -122,7 +122,7 @@ def test_calibrations_that_are_independent_are_consistent(rng):
 
 def test_the_truth_of_other_axes_has_no_covariance_of_such_an_error(tmp_path, rng):
     write_runs(tmp_path, "rvec", rng, runs=2)
-    with pytest.raises(cs.InputError, match=r"--truth-covariance: .*'rvec'"):
+    with pytest.raises(cs.InputError, match=r"truth_covariance: .*'rvec'"):
         cs.read(
             tmp_path / "est/00.txt", tmp_path / "est/01.txt", error="rvec", truth_covariance="columns",
             truth_world="ned", truth_body_axes="frd", time_offset=0.0,

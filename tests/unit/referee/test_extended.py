@@ -160,14 +160,14 @@ def test_what_does_not_fit_is_named(key, value, said, tmp_path):
 def test_the_error_has_to_be_declared(options, tmp_path):
     arrays, _, P = states("left")
     with pytest.raises(
-        cs.InputError, match=r"whose error is not known; add --error so3, .*, rvec, euler, additive: left"
+        cs.InputError, match=r"whose error is not known; add error=so3, .*, rvec, euler, additive: left"
     ):
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
 
 
 def test_windows_are_refused(tmp_path):
     arrays, _, P = states("left")
-    with pytest.raises(cs.InputError, match="--relative needs"):
+    with pytest.raises(cs.InputError, match="relative needs"):
         cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), error="left", relative=2, motions=True)
 
 
@@ -323,6 +323,6 @@ def test_the_additive_error_is_of_states(inside):
     est = lines(
         "est.csv", ",".join(["t", *POSE, *stated(6, "full")]), [T, *alone, *P[0, :, :6, :6].reshape(STEPS, -1).T]
     )
-    with pytest.raises(cs.InputError, match="--error additive: for a trajectory in space it is one of so3, so3-body"):
+    with pytest.raises(cs.InputError, match="error=additive: for a trajectory in space it is one of so3, so3-body"):
         cs.read(est, truth=named(arrays), error="additive")
     assert cs.read(est, truth=named(arrays)).errors.axes == tuple(LABELS[:6])

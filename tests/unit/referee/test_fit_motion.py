@@ -125,7 +125,7 @@ def test_a_way_by_turn_is_found_named_and_corrected(rng):
     assert replace(shown, by_motion=None).status == "consistent"
     assert replace(shown, by_motion=replace(found, share=0.09)).status == "consistent"
     assert cs.fit_covariance(made, SPAN, correct=False).by_motion is None
-    with pytest.raises(InputError, match="--by-turn is a correction"):
+    with pytest.raises(InputError, match="by_turn is a correction"):
         cs.fit_covariance(made, SPAN, correct=False, by_turn=True)
 
 
@@ -324,7 +324,7 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path, rng):
 
 
 def test_jumps_name_the_offset_of_clocks(rng):
-    with pytest.raises(InputError, match=r"have a jump.*clocks of estimates and truth differ.*--time-offset"):
+    with pytest.raises(InputError, match=r"have a jump.*clocks of estimates and truth differ.*time_offset="):
         cs.fit_covariance(drives(rng, 2, World(jumps=8)), SPAN)
 
 

@@ -143,7 +143,7 @@ def test_columns_of_a_solution_make_groups(name, inside):
     record = cs.read(rover, truth=base, by=name)
     assert record.runs.by[0].tolist() == values
     assert record.groups.names == (f"{name} <= 1", f"{name} > 1")
-    with pytest.raises(cs.InputError, match=r"--by q: .*rover\.pos has no such column; there are: Q, ns, sdn, .*ratio"):
+    with pytest.raises(cs.InputError, match=r"by=q: .*rover\.pos has no such column; there are: Q, ns, sdn, .*ratio"):
         cs.read(rover, truth=base, by="q")
 
 

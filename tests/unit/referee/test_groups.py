@@ -438,7 +438,7 @@ def test_a_trajectory_with_a_table(tmp_path):
     files = {"truth": tmp_path / "truth.txt", "covariance": tmp_path / "P.txt", "error": "so3"}
     record = cs.read(tmp_path / "est.txt", **files, by="n_matches", by_file=tmp_path / "m.csv")
     assert record.runs.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
-    with pytest.raises(cs.InputError, match="has no columns of its own; --by-file FILE names a table"):
+    with pytest.raises(cs.InputError, match="has no columns of its own; by_file=FILE names a table"):
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
     names = "t,x,y,z,qx,qy,qz,qw,n_matches"
     named = np.column_stack([estimate, np.arange(400) % 7])
@@ -464,7 +464,7 @@ def test_windows_take_the_value_at_their_beginning(tmp_path):
 
 def test_innovations_have_no_groups(tmp_path):
     (tmp_path / "nis.csv").write_text("t,nis,nis_dof,mode\n0,1,1,1\n1,1,1,2\n")
-    with pytest.raises(cs.InputError, match=r"--by mode: .*nis.csv has no truth"):
+    with pytest.raises(cs.InputError, match=r"by=mode: .*nis.csv has no truth"):
         cs.read(tmp_path / "nis.csv", by="mode")
 
 
@@ -482,7 +482,7 @@ def test_a_key_of_an_archive(tmp_path):
     np.savez(tmp_path / "mine.npz", errors=error, covariances=covariance, mode=column, lab=np.arange(40) % 2)
     assert cs.read(tmp_path / "mine.npz", by="lab").groups.index[:3, 5].tolist() == [0, 1, 0]
     assert cs.judge(cs.read(tmp_path / "mine.npz", by="mode")).by_group.worst.name == "mode <= 0"
-    with pytest.raises(cs.InputError, match=r"--by speed: .* has no such key; it holds"):
+    with pytest.raises(cs.InputError, match=r"by=speed: .* has no such key; it holds"):
         cs.read(tmp_path / "mine.npz", by="speed")
     nees = np.square(error).sum(-1)
     np.savez(tmp_path / "nees.npz", nees=nees, dof=2, mode=column)

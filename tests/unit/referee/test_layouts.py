@@ -412,7 +412,7 @@ def test_deviations_are_judged_axis_by_axis(write, inside):
         turned = cs.read(own, truth=truth, covariance_order="rotation-translation")
         assert_allclose(turned.errors.nees, record.errors.nees, rtol=1e-9)
     assert list(cs.judge(record).parts) == [*SPACE, "roll", "pitch", "yaw"]
-    with pytest.raises(cs.InputError, match="--relative needs covariances of whole poses"):
+    with pytest.raises(cs.InputError, match="relative needs covariances of whole poses"):
         cs.read(path, truth=truth, relative=2, motions=True)
 
 

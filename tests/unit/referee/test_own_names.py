@@ -176,10 +176,10 @@ def test_axes_need_poses(tmp_path):
     t = np.arange(STEPS, dtype=float)
     own = table(tmp_path / "own.csv", ["t", "a", "P_a_a"], t, t, t + 1.0)
     truth = table(tmp_path / "truth.csv", ["t", "a"], t, t + 0.5)
-    with pytest.raises(cs.InputError, match=r"--world: needs poses or positions with a truth; .*own\.csv has none"):
+    with pytest.raises(cs.InputError, match=r"world: needs poses or positions with a truth; .*own\.csv has none"):
         cs.read(own, truth, state=["a"], world="ned")
     np.savez(tmp_path / "a.npz", errors=np.ones((2, 3, 1)), covariances=np.ones((2, 3, 1, 1)))
-    with pytest.raises(cs.InputError, match=r"--world: does not go with .*a\.npz"):
+    with pytest.raises(cs.InputError, match=r"world: does not go with .*a\.npz"):
         cs.read(tmp_path / "a.npz", world="ned")
     rows = table(tmp_path / "plane.csv", PLANE, t, np.ones((STEPS, 3)), np.ones((STEPS, 1)) * [1, 0, 0, 1, 0, 1])
     with pytest.raises(cs.InputError, match=r"both up or both down; the estimates are in ned and flu, the"):
@@ -230,7 +230,7 @@ def test_a_folder_of_tables_is_read_as_runs(tmp_path):
         one = cs.read(tmp_path / "est" / f"{run}.csv", tmp_path / "truth" / f"{run}.csv", columns=columns)
         assert_allclose(record.errors.nees[run], one.errors.nees[0], rtol=1e-12)  # type: ignore[index]
     (tmp_path / "truth" / "2.csv").unlink()
-    with pytest.raises(cs.InputError, match=r"--truth .*truth: holds no table '2' for .*2\.csv"):
+    with pytest.raises(cs.InputError, match=r"truth=.*truth: holds no table '2' for .*2\.csv"):
         cs.read(tmp_path / "est", tmp_path / "truth", columns=columns)
 
 
@@ -250,7 +250,7 @@ def test_a_folder_of_poses_with_own_names(tmp_path):
             tmp_path / f"{word}.csv", [word if name == missing else name for name in [*POSE, "vn"]], true, P[:, 0, 0]
         )
         with pytest.raises(
-            cs.InputError, match=rf"{word}\.csv: column '{missing}' is missing; there are: .*, vn; --columns"
+            cs.InputError, match=rf"{word}\.csv: column '{missing}' is missing; there are: .*, vn; columns="
         ):
             cs.read(tmp_path / "est" / "0.csv", own, columns=names)
 
@@ -320,9 +320,9 @@ def test_names_that_cannot_be_used_are_refused(columns, why, tmp_path, capsys):
 def test_refusals_name_the_option(tmp_path):
     t = np.arange(STEPS, dtype=float)
     own = table(tmp_path / "own.csv", ["clock", "pos_n", "pos_e"], t, t, t)
-    with pytest.raises(cs.InputError, match=r"--columns t=NAME says what it is called, in a truth --truth-columns"):
+    with pytest.raises(cs.InputError, match=r"columns=t=NAME says what it is called, in a truth truth_columns="):
         cs.read(own, own)
-    with pytest.raises(cs.InputError, match=r"column 'x' is missing; .*; --columns x=NAME says what it is called"):
+    with pytest.raises(cs.InputError, match=r"column 'x' is missing; .*; columns=x=NAME says what it is called"):
         cs.read(own, own, columns={"t": "clock"}, truth_columns={"t": "clock"})
 
 

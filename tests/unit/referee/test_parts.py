@@ -139,7 +139,7 @@ def test_misuse_is_refused(rng):
         cs.judge(error, diagonal(error), deviations=error)
     with pytest.raises(cs.InputError, match=r"deviations has shape \(60, 12, 2\)"):
         cs.judge(error, deviations=error[..., :2])
-    with pytest.raises(cs.InputError, match="--truth-covariance needs covariances"):
+    with pytest.raises(cs.InputError, match="truth_covariance needs covariances"):
         cs.judge(error, deviations=np.ones(error.shape), truth_covariances=diagonal(np.ones(error.shape)))
     with pytest.raises(ValueError, match="has no errors"):
         each_alone(make_record("f", nees=np.ones((3, 2)), dof=2))

@@ -215,9 +215,9 @@ def test_what_is_wrong_is_named_by_table_and_row(tmp_path):
         cs.read(own[:0], truth=truth, state=["a", "b"])
     with pytest.raises(cs.InputError, match=r"^estimates: column 'a' is duplicated"):
         cs.read(own.rename(columns={"b": "a"}), truth=truth, state=["a", "b"])
-    with pytest.raises(cs.InputError, match=r"^estimates: needs --truth FILE"):
+    with pytest.raises(cs.InputError, match=r"^estimates: needs truth=FILE"):
         cs.read(own, state=["a", "b"])
-    with pytest.raises(cs.InputError, match=r"^--covariance: does not go with tables in memory"):
+    with pytest.raises(cs.InputError, match=r"^covariance: does not go with tables in memory"):
         cs.read(own, truth=truth, covariance="P.txt", state=["a", "b"])
 
 

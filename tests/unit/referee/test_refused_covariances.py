@@ -46,9 +46,9 @@ def test_a_variance_of_zero_beside_errors_is_too_small(without, rng):
         cs.judge(error, P, axes=names)
     size = np.sqrt(np.square(error[..., missing]).mean())
     assert f"errors of {', '.join(without)} are not zero ({size:.2f} RMS)" in str(refused.value)
-    assert f"--state {rest} for a table, judges the rest alone" in str(refused.value)
+    assert f"state={rest} for a table, judges the rest alone" in str(refused.value)
     error[..., missing] = 0.0
-    with pytest.raises(InputError, match=f"judge only what the filter estimates: --axes {rest} "):
+    with pytest.raises(InputError, match=f"judge only what the filter estimates: axes={rest} "):
         cs.judge(error, P, axes=names)
 
 

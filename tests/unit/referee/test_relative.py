@@ -189,7 +189,7 @@ def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
     found = windows_of(s, Relative(1, "step"))
     assert_allclose(record.errors.covariance[0], found.covariance, rtol=1e-9)
     assert_allclose(record.errors.error[0], found.error, atol=1e-12)
-    with pytest.raises(cs.InputError, match="line 3: --relative 2: the window spans 2 rows"):
+    with pytest.raises(cs.InputError, match="line 3: relative=2: the window spans 2 rows"):
         cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=2)
     keep = np.arange(9) != 4
     lines(tmp_path / "some.tum", s.t[keep], s.estimate[keep])
@@ -216,7 +216,7 @@ def test_tables_and_archives_of_motions(tmp_path, rng):
     assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
     np.savez(tmp_path / "m.npz", estimates=s.estimate, truth=s.truth, covariances=s.covariance)
     assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).errors.nees, expected.errors.nees, rtol=1e-9)
-    with pytest.raises(cs.InputError, match="--relative 1s needs a column t"):
+    with pytest.raises(cs.InputError, match="relative=1s needs a column t"):
         cs.read(tmp_path / "m.npz", relative="1s", motions=True)
 
 
@@ -261,12 +261,12 @@ def test_marginal_covariances_are_refused_with_the_remedy(motion_file, capsys):
 def test_what_has_no_poses_is_refused(tmp_path, rng):
     s = motion_stretch(drive(rng, "SE(2)", 10))
     path = table(tmp_path / "m.csv", s, False)
-    with pytest.raises(cs.InputError, match="--relative needs poses x, y, heading"):
+    with pytest.raises(cs.InputError, match="relative needs poses x, y, heading"):
         cs.read(path, tmp_path / "truth.csv", error="vector", relative=1, motions=True)
-    with pytest.raises(cs.InputError, match="--relative needs --truth FILE"):
+    with pytest.raises(cs.InputError, match="relative needs truth=FILE"):
         cs.read(path, relative=1, motions=True)
     np.savez(tmp_path / "e.npz", errors=np.ones((30, 4, 2)), covariances=np.broadcast_to(np.eye(2), (30, 4, 2, 2)))
-    with pytest.raises(cs.InputError, match="--relative needs the keys estimates, truth, covariances"):
+    with pytest.raises(cs.InputError, match="relative needs the keys estimates, truth, covariances"):
         cs.read(tmp_path / "e.npz", relative=1)
 
 

@@ -308,7 +308,7 @@ def test_a_record_and_its_verdict_draw_themselves(archive, tmp_path):
     assert "<dt>runs</dt><dd>30</dd>" in record._repr_html_()
     with pytest.raises(cs.InputError, match=r"must end in \.png, \.pdf, \.svg"):
         record.plot(tmp_path / "v.jpg")
-    with pytest.raises(cs.InputError, match="--false-alarm must lie between 0 and 1"):
+    with pytest.raises(cs.InputError, match="false_alarm must lie between 0 and 1"):
         cs.judge(record, false_alarm=2.0)
 
 

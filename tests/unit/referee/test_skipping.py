@@ -162,12 +162,12 @@ def test_a_run_that_had_nothing_has_lost_nothing():
 
 def test_refusals(archive, tmp_path, errors):
     record = cs.read(archive)
-    with pytest.raises(InputError, match="--skip 40: nothing of mine is left, whose last step is 40"):
+    with pytest.raises(InputError, match="skip=40: nothing of mine is left, whose last step is 40"):
         cs.judge(record, skip=STEPS)
     np.savez(tmp_path / "bare.npz", errors=errors, covariances=identities(errors))
-    with pytest.raises(InputError, match="--skip 2s: there are no times; give a number of steps"):
+    with pytest.raises(InputError, match="skip=2s: there are no times; give a number of steps"):
         cs.judge(cs.read(tmp_path / "bare.npz"), skip="2s")
-    with pytest.raises(InputError, match=r"--skip 2\.5: must be a whole number of steps"):
+    with pytest.raises(InputError, match=r"skip=2\.5: must be a whole number of steps"):
         cs.judge(record, skip=2.5)
 
 

@@ -45,7 +45,7 @@ ABOUT = {
     MISSED: "it is called consistent, though no single one is right",
     REJECTS: "the gate of a right filter is said to reject too few or too many; runs are steps",
     **{
-        f"{name}, gate {level:g}": f"the Kalman filter `{name}` behind a gate of {level:g}; runs are steps"
+        f"gate {level:g} of {name}": f"the Kalman filter `{name}` behind a gate of {level:g}; runs are steps"
         for name in ("position", "velocity")
         for level in LEVELS
     },
@@ -113,5 +113,5 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
             for steps in STEPS[:1] if quick else STEPS:
                 rng = np.random.default_rng((seed, steps, round(100 * level)))
                 found = gate_findings(kind, rng, steps, missions, level)
-                table.append(row(f"{name}, gate {level:g}", REJECTS, 1.0, steps, 0.05, "<=", missions, found))
+                table.append(row(f"gate {level:g} of {name}", REJECTS, 1.0, steps, 0.05, "<=", missions, found))
     return table

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics.records.record import Ensemble, RatioTable, Record
-from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
+from consistency.referee.diagnostics.records.whitening import all_finite, every_entry, squared_length, whiten
 from consistency.referee.diagnostics.verdict.parts import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -234,7 +234,7 @@ def of_ensemble(record: Record, N: int) -> Record:
     return replace(
         record,
         error=numbers,
-        covariance=np.where(np.isfinite(numbers).all(axis=-1)[..., None, None], np.eye(n), np.nan),
+        covariance=np.where(all_finite(numbers)[..., None, None], np.eye(n), np.nan),
         nees=squared_length(numbers),
         tables=tuple(filter(None, tables)),
         ensemble=drawn,
@@ -266,7 +266,7 @@ def of_repeats(record: Record) -> Record:
         raise InputError(f"--truth repeats: {record.name} needs estimates of 2 runs or more, with covariances")
     error = np.full(record.error[1:].shape, np.nan)
     covariance = np.full(record.covariance[1:].shape, np.nan)
-    counted: Array = np.isfinite(record.error).all(axis=-1) & every_entry(np.isfinite, record.covariance)
+    counted = all_finite(record.error) & every_entry(np.isfinite, record.covariance)
     if record.nees is not None:  # a covariance that is singular, or not positive definite, is of no use
         counted &= np.isfinite(record.nees)
     mean = np.where(counted[0, :, None], record.error[0], 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.diagnostics.records.record import Ensemble, RatioTable, Record
-from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
+from consistency.referee.diagnostics.records.whitening import all_finite, every_entry, squared_length, whiten
 from consistency.referee.diagnostics.verdict.parts import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
@@ -235,7 +235,7 @@ def of_ensemble(record: Record, N: int) -> Record:
     errors = replace(
         record.errors,
         error=numbers,
-        covariance=np.where(np.isfinite(numbers).all(axis=-1)[..., None, None], np.eye(n), np.nan),
+        covariance=np.where(all_finite(numbers)[..., None, None], np.eye(n), np.nan),
         nees=squared_length(numbers),
         tables=tuple(filter(None, tables)),
         ensemble=drawn,
@@ -267,7 +267,7 @@ def of_repeats(record: Record) -> Record:
         raise InputError(f"--truth repeats: {record.name} needs estimates of 2 runs or more, with covariances")
     error = np.full(record.errors.error[1:].shape, np.nan)
     covariance = np.full(record.errors.covariance[1:].shape, np.nan)
-    counted: Array = np.isfinite(record.errors.error).all(axis=-1) & every_entry(np.isfinite, record.errors.covariance)
+    counted = all_finite(record.errors.error) & every_entry(np.isfinite, record.errors.covariance)
     if record.errors.nees is not None:  # a covariance that is singular, or not positive definite, is of no use
         counted &= np.isfinite(record.errors.nees)
     mean = np.where(counted[0, :, None], record.errors.error[0], 0.0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from consistency.referee.diagnostics.records.whitening import all_finite
 from consistency.referee.diagnostics.statistics.normal_numbers import SEED, TOGETHER, is_joint
 from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
@@ -24,14 +25,15 @@ def checked_members(members: Array, known: Array, place: Callable[[int], str]) -
     InputError
         Some members of a step that is ``known`` (k,) are not finite, and others are.
     """
-    finite: Array = np.asarray(np.isfinite(members).all(axis=-1))
-    partly = np.flatnonzero(known & finite.any(axis=-1) & ~finite.all(axis=-1))
+    finite = all_finite(members)
+    whole = all_finite(members.reshape(len(members), -1))
+    partly = np.flatnonzero(known & finite.any(axis=-1) & ~whole)
     if len(partly):
         row = int(partly[0])
         which = f"member {np.argmin(finite[row]) + 1} of {members.shape[1]} is not finite"
         remedy = "all steps need equally many members; NaN in all of them says that the filter failed"
         raise InputError(f"{place(row)}: {which}; {remedy}")
-    return np.where(finite.all(axis=-1)[:, None, None], members, np.nan)
+    return np.where(whole[:, None, None], members, np.nan)
 
 
 def of_members(e: Estimator, r: Reading) -> Estimator:

@@ -28,6 +28,8 @@ NOT_RUN = [
     ("docs/any-program.md", "", "needs MATLAB, Julia and ROS; tests/smoke/test_cpp_example.py runs what is in C++"),
     ("docs/case-studies.md", "python docs/case-studies", "needs the libraries; tests/oracle/test_case_studies_live.py"),
     ("docs/characterise.md", "CONSISTENCY_DATA=DIR consistency reproduce", STUDY),
+    ("README.md", "pip install \"filter-consistency", "needs the network"),
+    ("README.md", "consistency inspect est.csv", "tests/unit/referee/test_inspect.py"),
     ("docs/coming-from.md", "", "test_inspect.py reads a trajectory with its truth beside it"),
     ("docs/ros.md", "", "needs bags of a robot; test_inspect.py and test_bags.py write some"),
     ("docs/long-runs.md", "openssl", CLUSTER),

@@ -306,9 +306,9 @@ def test_without_a_true_velocity_the_pose_is_judged(inside):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({}, r"est\.csv: holds a covariance of poses with their velocity, whose error is not known; add --error so3"),
-        ({"error": "guess"}, r"add --error so3, .*, rvec, euler, additive \('guess' is for poses alone\)"),
-        ({"error": "left", "axes": ["bgx"]}, r"--axes bgx: 'bgx' is not one of x, y, z, roll, pitch, yaw, vx, vy, vz$"),
+        ({}, r"est\.csv: holds a covariance of poses with their velocity, whose error is not known; add error=so3"),
+        ({"error": "guess"}, r"add error=so3, .*, rvec, euler, additive \('guess' is for poses alone\)"),
+        ({"error": "left", "axes": ["bgx"]}, r"axes=bgx: 'bgx' is not one of x, y, z, roll, pitch, yaw, vx, vy, vz$"),
     ],
 )
 def test_what_has_to_be_declared(options, said, inside):

@@ -346,7 +346,7 @@ def test_increments_and_placeholders_are_named(world, rng):
     drive = drives(rng, 1, world, 300.0)[0]
     require_poses([drive])
     cases = (
-        ({"estimate": increments(drive.estimate)}, r"estimates seem to be motions.*give --motions"),
+        ({"estimate": increments(drive.estimate)}, r"estimates seem to be motions.*give motions="),
         ({"truth": increments(drive.truth)}, r"truth seem to be motions.*compound them"),
         ({"estimate": unturned(drive.estimate)}, r"rows of the estimates have one orientation.*placeholder"),
         ({"truth": unturned(drive.truth)}, r"rows of the truth have one orientation.*give truth with"),

@@ -281,9 +281,9 @@ def test_what_is_broken_is_one_line(old, new, said, inside):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"lever_arm": [0.0, 0.0, 1.0]}, r"--lever-arm: does not go with rover\.pos, of positions with their own"),
-        ({"error": "left"}, r"--error: does not go with rover\.pos"),
-        ({"relative": 2, "motions": True}, r"--relative: needs a truth with orientations"),
+        ({"lever_arm": [0.0, 0.0, 1.0]}, r"lever_arm: does not go with rover\.pos, of positions with their own"),
+        ({"error": "left"}, r"error: does not go with rover\.pos"),
+        ({"relative": 2, "motions": True}, r"relative: needs a truth with orientations"),
     ],
 )
 def test_options_of_orientations_are_refused(options, said, inside):

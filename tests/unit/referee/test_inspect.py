@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,8 @@ from test_fixes import PLACE, STEPS, solution
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.kitti_files import read_drive
+from consistency.referee.readers.options import Reading
+from consistency.referee.verdicts.inspect_sources import _command
 
 RUNS, ROWS = 6, 40
 
@@ -92,6 +95,7 @@ def json_lines(folder, rng):
 def another_state(folder, rng):
     true = rng.normal(size=(ROWS, 2))
     columns = {"depth": true[:, 0] + 0.1, "speed": true[:, 1], "sigma_depth": 0.2, "sigma_speed": 0.1}
+    columns |= {"mode": 1.0, "true_mode": 1.0}  # without a covariance
     columns |= {"true_depth": true[:, 0], "true_speed": true[:, 1] + 0.05, "step": np.arange(1, ROWS + 1)}
     pd.DataFrame(columns).to_csv(folder / "my est.csv", index=False)
     return folder / "my est.csv"
@@ -365,6 +369,14 @@ def test_a_refusal_names_an_inspection_that_would_say_more(tmp_path, capsys):
     (tmp_path / "only").mkdir()
     shutil.move(path, tmp_path / "only")
     assert "inspect" not in refused(capsys, "analyse", tmp_path / "only" / "est.txt")
+
+
+def test_a_command_line_has_every_kind_of_option():
+    reading = Reading(axes=["x", "y"], relative="2", motions=True, columns={"x": "px", "y": "py"})
+    assert shlex.split(_command("analyse", Path("my est"), reading, ("--bins", "3"))) == [
+        "consistency", "analyse", "my est", "--axes", "x,y", "--relative", "2", "--motions", "--columns", "x=px,y=py",
+        "--bins", "3",
+    ]  # fmt: skip
 
 
 def test_json_is_for_programs(tmp_path, capsys):

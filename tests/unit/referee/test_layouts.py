@@ -687,7 +687,7 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
             "d/0.csv",
             "t,x,y,heading",
             "0,1,2,3\n",
-            r"0\.csv: column 'P_xx' is missing; .*; --columns P_xx=NAME says what it is called",
+            r"0\.csv: column 'P_xx' is missing; .*; columns=P_xx=NAME says what it is called",
         ),
     ],
 )

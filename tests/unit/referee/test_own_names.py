@@ -159,10 +159,10 @@ def test_a_truth_of_positions(tmp_path):
 @pytest.mark.parametrize(
     "options, why",
     [
-        ({"world": "neu"}, r"--world neu: is not right-handed"),
-        ({"truth_world": "ne"}, r"--truth-world ne: must be three letters of e, w, n, s, u, d"),
-        ({"body_axes": "ned"}, r"--body-axes ned: must be three letters of f, b, l, r, u, d"),
-        ({"truth_body_axes": "flf"}, r"--truth-body-axes flf: is not right-handed"),
+        ({"world": "neu"}, r"world=neu: is not right-handed"),
+        ({"truth_world": "ne"}, r"truth_world=ne: must be three letters of e, w, n, s, u, d"),
+        ({"body_axes": "ned"}, r"body_axes=ned: must be three letters of f, b, l, r, u, d"),
+        ({"truth_body_axes": "flf"}, r"truth_body_axes=flf: is not right-handed"),
     ],
 )
 def test_axes_that_are_none_are_refused(options, why, tmp_path):

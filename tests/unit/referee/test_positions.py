@@ -159,12 +159,12 @@ def test_a_frame_is_fitted_to_positions(inside):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"align": "se3-all"}, r"--align se3-all: needs a truth with orientations; prism\.txt"),
-        ({"align": "origin"}, r"--align origin: needs a truth with orientations; prism\.txt holds positions alone"),
-        ({"relative": 2, "motions": True}, r"--relative: needs a truth with orientations; prism\.txt"),
-        ({"axes": ["x", "yaw"]}, "--axes x,yaw: 'yaw' has no truth"),
-        ({"lever_arm": [1.0, 2.0]}, "--lever-arm: must be three numbers x,y,z, in m"),
-        ({"lever_arm": [1.0, 2.0, float("nan")]}, "--lever-arm: must be three numbers x,y,z, in m"),
+        ({"align": "se3-all"}, r"align=se3-all: needs a truth with orientations; prism\.txt"),
+        ({"align": "origin"}, r"align=origin: needs a truth with orientations; prism\.txt holds positions alone"),
+        ({"relative": 2, "motions": True}, r"relative: needs a truth with orientations; prism\.txt"),
+        ({"axes": ["x", "yaw"]}, "axes=x,yaw: 'yaw' has no truth"),
+        ({"lever_arm": [1.0, 2.0]}, "lever_arm: must be three numbers x,y,z, in m"),
+        ({"lever_arm": [1.0, 2.0, float("nan")]}, "lever_arm: must be three numbers x,y,z, in m"),
     ],
 )
 def test_what_needs_an_orientation_is_refused(options, said, inside):

@@ -79,7 +79,7 @@ def test_windows_are_moved_by_an_offset(tmp_path):
 
 
 def test_motions_has_no_opposite(capsys):
-    shown, _ = consistency(capsys, "analyse", "--help")
+    shown, _ = consistency(capsys, "analyse", "--help-all")
     assert "--motions " in shown
     assert "--no-motions" not in shown
 

@@ -184,7 +184,7 @@ def test_names_that_were_read_before_are_read_so(inside):
     assert_allclose(data.read(deviations).errors.nees[0], (data.error**2).sum(axis=1), rtol=1e-9)
     check(data.read(canonical | {"x_est": 9.0, "theta": 9.0}), data)
     canonical.pop("P_xh")
-    with pytest.raises(cs.InputError, match=r"column 'P_xh' is missing; .*--state a,b judges fewer"):
+    with pytest.raises(cs.InputError, match=r"column 'P_xh' is missing; .*state=a,b judges fewer"):
         data.read(canonical)
 
 

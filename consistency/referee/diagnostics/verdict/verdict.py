@@ -296,7 +296,7 @@ class Verdict(Findings):
         Parameters
         ----------
         path : a folder for the page, the PDF and the JSON; or FILE.xml (JUnit) or FILE.md
-        overwrite : replace also what is no earlier report
+        overwrite : replace also files other than earlier reports
 
         Raises
         ------

@@ -74,13 +74,13 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     for q in LEVELS:
         planned = bound_runs(q)
         world = f"constant, {100 * q:g} %"
-        for question, ratio, runs in (
+        for question, ratio, needed in (
             (POWER, WRONG**2, planned.small), (POWER, WRONG**-2, planned.large), (RIGHT, 1.0, planned.consistent),
         ):  # fmt: skip
-            assert runs is not None
-            counts = _counted(_key(seed, world, runs), 1.0, q, runs, gates, ratio**0.5)
+            assert needed is not None
+            counts = _counted(_key(seed, world, needed), 1.0, q, needed, gates, ratio**0.5)
             found = counts["shown" if ratio == 1.0 else "small" if ratio > 1.0 else "large"]
-            table.append(row(world, question, ratio, runs, 0.95, ">=", gates, found))
+            table.append(row(world, question, ratio, needed, 0.95, ">=", gates, found))
     for kind in ENDED:
         for name, phi in CORRELATIONS.items():
             for q in LEVELS:

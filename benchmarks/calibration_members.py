@@ -114,6 +114,6 @@ def rows_of(
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
     table = []
-    for *case, gates in cases()[::20] if quick else cases():
-        table += rows_of(*case, QUICK_GATES if quick else gates, seed)
+    for world, draw, case, runs, gates in cases()[::20] if quick else cases():
+        table += rows_of(world, draw, case, runs, QUICK_GATES if quick else gates, seed)
     return table

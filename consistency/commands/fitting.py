@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +20,7 @@ from consistency.commands.shared_options import (
     tell_notes,
 )
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import OPTIONS, Reading
 
 KEPT = (
     "truth", "max_dt", "time_offset", "topic", "truth_topic", "body", "columns", "truth_columns", "world", "body_axes",
@@ -112,7 +111,7 @@ def fit_covariance_command(
 
 
 NOT_CORRECTED = ("relative", "motions", "windows", "truth_covariance", "truth_errors", "truth_shared")
-CORRECTABLE = [each.name for each in fields(Reading) if each.name not in NOT_CORRECTED]
+CORRECTABLE = [each.name for each in OPTIONS if each.name not in NOT_CORRECTED]
 
 
 @reads_files(only=CORRECTABLE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import Field, fields
+from dataclasses import Field
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import OPTIONS, Reading, flag_of
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
@@ -160,8 +160,8 @@ def reads_files(
         return partial(reads_files, only=only, without=without)
     signature = inspect.signature(command, eval_str=True)
     hints = get_type_hints(Reading)
-    taken = [each for each in fields(Reading) if only is None or each.name in only]
-    taken = [each for each in taken if each.metadata and each.name not in without]
+    taken = [each for each in OPTIONS if only is None or each.name in only]
+    taken = [each for each in taken if each.name not in without]
     own = {each.name: _parameter(each, hints[each.name]) for each in taken}
 
     @wraps(command)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +19,7 @@ from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import document, summary
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.formats.archives import UNWEIGHTED
-from consistency.referee.readers.options import REPEATS, Reading
+from consistency.referee.readers.options import OPTIONS, REPEATS, Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
@@ -172,7 +172,7 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
         There is no such file, its kind is unknown, or there is no such option.
     """
     for name in options:
-        if name not in (there := [each.name for each in fields(Reading)]):
+        if name not in (there := [each.name for each in OPTIONS]):
             raise InputError(f"{name}: is not an option of files; there are: {', '.join(there)}")
     given: dict[str, Any] = {
         name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()

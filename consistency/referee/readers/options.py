@@ -86,9 +86,7 @@ def _option(
 class Reading:
     """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
 
-    truth: Path | None = _option(
-        "Truth in the form of the estimates, or a KITTI drive; 'repeats' where all runs have the same true values."
-    )
+    truth: Path | None = _option("Truth like the estimates, KITTI drive, or 'repeats'.")
     covariance: Path | None = _option("Covariances of a TUM trajectory: t, 36 or 21 numbers.")
     error: str | None = _option(
         "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
@@ -114,9 +112,7 @@ class Reading:
         "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
     )
     windows: str | None = _option("'independent': treat each window as an independent run.")
-    independent: bool | None = _option(
-        "Treat each row, or window, as an independent run: a calibration, an image, a detection.", flag="--independent/"
-    )
+    independent: bool | None = _option("Each row, or window, is an independent run.", flag="--independent/")
     align: str | None = _option(
         "Move estimates into the world of the truth: none; origin, by the first pose of each run; posyaw or se3, by "
         "a frame fitted to each run (posyaw-all, se3-all: to all).",
@@ -133,7 +129,7 @@ class Reading:
     truth_errors: str | None = _option("Dependence of the truth's errors: independent, per-run, or common to all runs.")
     truth_shared: bool | None = _option("Declare that the estimator has fused the truth.", flag="--truth-shared/")
     level: str | float | Mapping[str, Any] | None = _option(
-        "Level of bounds, radii and intervals: 95%, 2sigma, CEP; or bound_x=95%,radius_x_y=68%.", "LEVEL", str
+        "Level of bounds, radii, intervals: 95%, 2sigma, CEP.", "LEVEL", str
     )
     gaussian: bool | None = _option(
         "Read them (or deviations) at that --level as the covariance of a Gaussian, circular for radii.",
@@ -195,6 +191,9 @@ class Reading:
     def shift(self) -> float:
         """Seconds to add to the timestamps of the estimates, as far as that is said."""
         return self.time_offset if isinstance(self.time_offset, float) else 0.0
+
+
+OPTIONS = [each for each in fields(Reading) if each.metadata]  # those that users give
 
 
 def flag_of(name: str) -> str:

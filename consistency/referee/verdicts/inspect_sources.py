@@ -9,7 +9,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from itertools import chain, takewhile
 from pathlib import Path
@@ -26,7 +26,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import file_kinds, flight_logs
 from consistency.referee.readers.formats.columns import CLOCKS, OWN, TRUE, covariance_columns, state_columns, stem_of
 from consistency.referee.readers.formats.innovation_files import SeveralError
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import OPTIONS, Reading, flag_of
 from consistency.referee.readers.pipeline import read_files
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import WHOLE, Estimator, submatrices
@@ -268,7 +268,7 @@ def _names(path: Path, r: Reading) -> list[str]:
 
 def _advised(path: Path, tried: Attempt) -> Attempt:
     """With options that notes advise, each where its note is then gone; not where a note leaves a choice."""
-    options = {flag_of(each.name): each for each in fields(Reading)}
+    options = {flag_of(each.name): each for each in OPTIONS}
     for note in chain.from_iterable(record.origin.notes for record in tried.records):
         advised = ADVICE.search(note)
         if advised is None or note.count("--") > 1 or "or if" in note or advised[1] not in options:

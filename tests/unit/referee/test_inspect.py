@@ -225,7 +225,7 @@ def test_the_options_that_were_found_read_the_file_in_python(write, options, tmp
     assert set(found.arguments) == options
     assert {name for name, _ in found.options} == {f"--{name}" for name in options}
     record = cs.read(path, **found.arguments)
-    assert record.error is not None
+    assert record.errors.error is not None
     assert found.command in str(found)
 
 

@@ -44,7 +44,7 @@ def test_a_step_that_is_masked_in_part_is_refused(key, rng):
     for call in (cs.judge, assert_consistent):
         with pytest.raises(ValueError, match=f"{key}, run 2, step 7: {numbers} numbers are masked; mask all"):
             call(given["errors"], given["covariances"])
-    with pytest.raises(cs.InputError, match="run 2, step 1: 1 of 3 numbers"):
+    with pytest.raises(cs.InputError, match="errors, row 3: 1 of 3 numbers"):
         cs.judge(np.ma.array(np.ones((5, 3)), mask=partly((5, 3), 2, 1)), identities(3, 5), independent=True)
 
 

@@ -1,7 +1,6 @@
 """Options of files: one record for readers, commands and Python; tables in memory are read as files of them are."""
 
 import inspect
-from dataclasses import fields
 
 import numpy as np
 import pandas as pd
@@ -15,18 +14,18 @@ from records import changed
 import consistency as cs
 from consistency.diagnostics import make_record
 from consistency.referee.notebook import read_and_judge
-from consistency.referee.readers.options import MAX_DT, Reading, flag_of
+from consistency.referee.readers.options import MAX_DT, OPTIONS, Reading, flag_of
 from consistency.referee.readers.pipeline.read_files import own_names
 from consistency.testing import assert_consistent
 
 
 def test_python_has_every_option_of_files():
     names = list(inspect.signature(cs.read).parameters)
-    assert names == ["estimates", *(each.name for each in fields(Reading)), "filter"]
+    assert names == ["estimates", *(each.name for each in OPTIONS), "filter"]
 
 
 def test_each_option_of_python_reaches_the_readers_under_its_name(monkeypatch):
-    given = {each.name: f"the {each.name}" for each in fields(Reading)}
+    given = {each.name: f"the {each.name}" for each in OPTIONS}
     seen = []
     monkeypatch.setattr(read_and_judge, "read_recordings", lambda path, reading: [seen.append(reading)])
     with pytest.raises(AttributeError):  # of a record that is None

@@ -85,8 +85,11 @@ def record_of_arrays(
             raise InputError(f"deviations has shape {sigma.shape}, needs that of {first}, {shape}")
         arrays["covariances"] = diagonal(sigma)
     mask = np.zeros(shape[:2], bool)
-    for key, value in given.items():
-        mask |= masked_steps(key, value, shape[:2])
+    try:
+        for key, value in given.items():
+            mask |= masked_steps(key, value, shape[:2])
+    except InputError as error:
+        raise InputError(str(error).replace("run 0, step", "row") if independent else str(error)) from None
     for key, array in arrays.items():
         if array.ndim < 2 or array.shape[:2] != shape[:2]:  # shapes that do not fit are refused below
             continue

@@ -494,7 +494,7 @@ def _spread_and_skill(record: Record) -> Picture | None:
     """Size of the errors about the mean of the members against the spread of these."""
     if record.errors.ensemble is None:
         return None
-    m, spread, square = record.errors.ensemble
+    m, _, spread, square = record.errors.ensemble
     expected = spread * (1.0 + 1.0 / m)  # of the squared error about the mean of m members
 
     def paint(axes: Axes) -> None:

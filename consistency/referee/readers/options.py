@@ -129,7 +129,7 @@ class Reading:
     truth_errors: str | None = _option("Dependence of the truth's errors: independent, per-run, or common to all runs.")
     truth_shared: bool | None = _option("Declare that the estimator has fused the truth.", flag="--truth-shared/")
     level: str | float | Mapping[str, Any] | None = _option(
-        "Level of bounds, radii, intervals: 95%, 2sigma, CEP.", "LEVEL", str
+        "Level of bounds and radii: 95%, 2sigma, CEP.", "LEVEL", str
     )
     gaussian: bool | None = _option(
         "Read them (or deviations) at that --level as the covariance of a Gaussian, circular for radii.",

@@ -450,13 +450,16 @@ def _records_of_parts(record: Record) -> dict[str, Record]:
     records = {}
     for index in record.errors.parts:
         some = list(index)
+        ensemble = record.errors.ensemble
+        if ensemble is not None:
+            ensemble = ensemble._replace(tables=tuple(ensemble.tables[i] for i in index))
         errors = replace(
             record.errors,
             error=record.errors.error[..., some],
             covariance=covariance[..., some, :][..., some],
             dof=len(some),
             axes=tuple(axes[i] for i in index),
-            tables=tuple(record.errors.tables[i] for i in index if record.errors.tables),
+            ensemble=ensemble,
             parts=(),
         )
         records[", ".join(names[i] for i in index)] = replace(record, errors=errors, innovations=InnovationRecord())

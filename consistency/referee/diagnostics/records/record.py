@@ -81,9 +81,10 @@ class Bound(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """Members of all runs and steps, as they are drawn."""
+    """Members of all runs and steps: what errors that are normal numbers say of them, and how they are drawn."""
 
     members: int
+    tables: tuple[RatioTable, ...]  # (n,), what mean squares of the numbers say of the covariance
     spread: Array  # (k, n), variances of the members of k steps
     square: Array  # (k, n), squares of truth less mean of the members
 
@@ -131,8 +132,7 @@ class Errors:
     parts: tuple[tuple[int, ...], ...] = ()
     assumed: bool = False  # no covariance is stated: it is I, to be corrected
     convention: str = ""  # of the error
-    tables: Sequence[RatioTable] = ()  # (n,), what mean squares of normal numbers say of the covariance; () of errors
-    ensemble: Ensemble | None = None  # what is drawn of it
+    ensemble: Ensemble | None = None  # of which the errors are normal numbers, as ranks among members are
     bounds: tuple[Bound, ...] = ()  # that are judged in place of covariances
     bound_ratios: Array | None = None  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
 
@@ -270,7 +270,8 @@ class Record:
 
     def table(self, index: Sequence[int] | None = None) -> RatioTable | None:
         """What mean squares of some components together say of the covariance, or of all; None if they are its."""
-        some = [self.errors.tables[i] for i in range(len(self.errors.tables)) if index is None or i in index]
+        tables = () if self.errors.ensemble is None else self.errors.ensemble.tables
+        some = [table for i, table in enumerate(tables) if index is None or i in index]
         if not some:
             return None
         ratios = some[0].true

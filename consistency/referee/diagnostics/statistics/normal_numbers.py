@@ -148,9 +148,10 @@ def of_ranks(record: Record, components: Sequence[int], members: Array, truth: A
     m, n = members.shape[1:]
     tables = rank_tables(m, n)
     own = [i for i in components if i < n]
-    drawn = Ensemble(m, members.var(axis=1, ddof=1)[:, own], np.square(truth - members.mean(axis=1))[:, own])
-    errors = replace(record.errors, tables=tuple(tables[i] for i in components), ensemble=drawn)
-    return replace(record, errors=errors)
+    square = np.square(truth - members.mean(axis=1))[:, own]
+    of_components = tuple(tables[i] for i in components)
+    ensemble = Ensemble(m, of_components, members.var(axis=1, ddof=1)[:, own], square)
+    return replace(record, errors=replace(record.errors, ensemble=ensemble))
 
 
 # --- mean and covariance of N members --------------------------------------------------------------------
@@ -227,7 +228,8 @@ def of_ensemble(record: Record, N: int) -> Record:
     if record.errors.nees is not None:
         numbers[~np.isfinite(record.errors.nees)] = np.nan
     variances = np.diagonal(record.errors.covariance, axis1=2, axis2=3)
-    drawn = Ensemble(N, *(values.reshape(-1, n) for values in (variances, np.square(record.errors.error))))
+    square = np.square(record.errors.error).reshape(-1, n)
+    ensemble = Ensemble(N, tuple(filter(None, tables)), variances.reshape(-1, n), square)
     note = (
         f"{record.name}: of {N} members, so that each error is Student's t; below it is the normal number at the same "
         "quantile, and ratios are those of the covariance"
@@ -237,8 +239,7 @@ def of_ensemble(record: Record, N: int) -> Record:
         error=numbers,
         covariance=np.where(all_finite(numbers)[..., None, None], np.eye(n), np.nan),
         nees=squared_length(numbers),
-        tables=tuple(filter(None, tables)),
-        ensemble=drawn,
+        ensemble=ensemble,
     )
     return replace(record, errors=errors).with_notes(note)
 

@@ -9,7 +9,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 COMMAND = r"'?consistency [a-z-]+[^;,:)']*'?"  # a command line, which keeps its flags
 # how what follows a flag begins, if it is its value
-WORDS = "auto|estimate|columns|half|optimal|posyaw|se3|origin|additive|left|right|so3"
+WORDS = "repeats|auto|estimate|columns|half|optimal|posyaw|se3|origin|additive|left|right|so3"
 VALUE = rf"[\w,]+ for |[-\d'\"./A-Z]|[\w.+-]+[:,=]|(?:{WORDS})\b"
 SUBJECT = r":| must| needs| is| goes"  # what follows a flag that is the subject of a sentence
 FLAG = re.compile(rf"({COMMAND})|(?<![\w-])--([a-z][a-z-]*)(?:(?={SUBJECT})|( (?={VALUE})|))")

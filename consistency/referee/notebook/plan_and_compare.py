@@ -135,4 +135,5 @@ def verdict_table(verdicts: Mapping[str, Verdict] | Iterable[Verdict]) -> pd.Dat
             "worst_axis": v.worst_axis[0] if v.worst_axis else "", "failed": len({f.run for f in v.failures}),
             "faults": ", ".join(v.faults),
         }  # fmt: skip
-    return pd.DataFrame.from_dict(rows, orient="index")
+    table: pd.DataFrame = pd.DataFrame.from_dict(rows, orient="index")
+    return table

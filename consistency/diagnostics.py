@@ -2,7 +2,7 @@
 
 from consistency.referee.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
 from consistency.referee.diagnostics.judge_record import follow, judge, look, speaks
-from consistency.referee.diagnostics.monitor import Alarm, Monitor
+from consistency.referee.diagnostics.monitor import Alarm, GateShare, Monitor
 from consistency.referee.diagnostics.questions.bias_and_shape import (
     Hotelling,
     Largest,
@@ -34,6 +34,8 @@ from consistency.referee.diagnostics.questions.whiteness import (
     whiteness,
 )
 from consistency.referee.diagnostics.records.record import (
+    Bound,
+    Ensemble,
     Errors,
     Evidence,
     InnovationRecord,
@@ -41,6 +43,7 @@ from consistency.referee.diagnostics.records.record import (
     Map,
     MapRecord,
     Origin,
+    RatioTable,
     Record,
     Rejections,
     Runs,
@@ -89,14 +92,17 @@ __all__ = [
     "Alarm",
     "Answer",
     "Band",
+    "Bound",
     "Comparison",
     "Design",
     "Difference",
     "EProcess",
     "EarlyEnds",
+    "Ensemble",
     "Equivalence",
     "Errors",
     "Evidence",
+    "GateShare",
     "Hotelling",
     "Independence",
     "InnovationRecord",
@@ -114,6 +120,7 @@ __all__ = [
     "Outlier",
     "PilotPlan",
     "Pit",
+    "RatioTable",
     "Record",
     "RejectionScore",
     "Rejections",

@@ -22,15 +22,15 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         verdict_table""",
     "consistency.challenging": "Challenge Plan challenge",
     "consistency.diagnostics": """
-        Alarm Answer Band Comparison Design Difference EProcess EarlyEnds Equivalence Errors Evidence Hotelling
-        Independence InnovationRecord Interval JointNees Largest Map MapRecord MapScore MeanTest Monitor NisTest
-        Normality Origin Outlier PilotPlan Pit Record RejectionScore Rejections RunSummary Runs Settings Skip Truth
-        TruthFit Verdict Whiteness anees anees_interval answers
+        Alarm Answer Band Bound Comparison Design Difference EProcess EarlyEnds Ensemble Equivalence Errors
+        Evidence GateShare Hotelling Independence InnovationRecord Interval JointNees Largest Map MapRecord
+        MapScore MeanTest Monitor NisTest Normality Origin Outlier PilotPlan Pit RatioTable Record RejectionScore
+        Rejections RunSummary Runs Settings Skip Truth TruthFit Verdict Whiteness anees anees_interval answers
         chi2_mean_interval clustered_share compare coverage coverage_interval detectable_ratio e_process early_ends
         equivalence ever follow gate_runs hotelling identity_statistic independence judge largest_direction look
         lost_bound lost_runs make_record map_score mean_shape mean_test nees nis_of nis_test nis_whiteness
-        noncredibility normality outliers pilot_plan pit power_of ratio_interval rejection_score required_runs
-        rmse sequential_design simultaneous_band speaks sphericity spread_steps standardise summary t_squared whiten
+        noncredibility normality outliers pilot_plan pit power_of ratio_interval rejection_score required_runs rmse
+        sequential_design simultaneous_band speaks sphericity spread_steps standardise summary t_squared whiten
         whiteness""",
     "consistency.errors": "InputError MissingPackageError",
     "consistency.filters": "filter_names filter_summaries get_filter guarded usable_names",

@@ -126,6 +126,28 @@ def table(at, rows):
         writer.writerows(rows)
 
 
+def detections(folder):
+    """pnp.txt with covariances, tag-est without, each beside its truth; nis.csv of a gate that never rejects."""
+    n = 200
+    place, turn = RNG.normal(size=(n, 3)), Rotation.random(n, random_state=20070)
+    error = RNG.normal(size=(n, 6)) * 0.01
+    variances = np.broadcast_to((np.eye(6) * 1e-4).ravel(), (n, 36))
+    moved = Rotation.from_rotvec(turn.as_rotvec() - error[:, :3])
+    rows(folder / "pnp.txt", np.arange(n), place - error[:, 3:], moved.as_quat(), variances)
+    rows(folder / "pnp-truth.txt", np.arange(n), place, turn.as_quat())
+    for run in range(6):
+        seen = turn * Rotation.from_rotvec(0.01 * RNG.normal(size=(n, 3)))
+        noise = 0.02 * RNG.normal(size=(n, 3))
+        rows(folder / f"tag-est/{run}.txt", 0.1 * np.arange(n), place - noise, seen.as_quat())
+        rows(folder / f"tag-truth/{run}.txt", 0.1 * np.arange(n), place, turn.as_quat())
+    table(folder / "nis.csv", [{"nis": 0.03 * value, "nis_dof": 3} for value in RNG.chisquare(3, 368)])
+
+
+def rows(at, *columns):
+    at.parent.mkdir(exist_ok=True, parents=True)
+    np.savetxt(at, np.column_stack(columns))
+
+
 def planar(folder, steps=20):
     """poses.csv and truth.csv: x, y, heading of 30 runs."""
     rng, sigma = RNG, np.array([0.1, 0.1, 0.02])
@@ -331,7 +353,7 @@ PREPARE = {
     "docs/monitor.md": [innovations],
     "docs/referee.md": [results("results", "DIR", "NEW")],
     "docs/regime.md": [log("log")],
-    "docs/what-can-be-stated.md": [ensembles, receiver],
+    "docs/what-can-be-stated.md": [ensembles, receiver, detections],
 }  # of a page, or of a part of it that has a folder of its own
 
 # --- names that the reader brings --------------------------------------------------------------------------

@@ -801,7 +801,7 @@ def test_a_long_study_takes_a_third_of_a_megabyte_of_a_page(results, tmp_path):
         scale = replace(track.verdict.scale, anees=peak, band=np.tile([2.0, 4.0], (steps, 1)))
         location = replace(track.verdict.location, simultaneous=np.tile([1.0, 5.0], (steps, 1)))
         shown = changed(
-            track.shown, runs=np.zeros(1, int), t=np.arange(1.0, steps + 1), error=rng.random((1, steps, 3)),
+            track.shown, numbers=np.zeros(1, int), t=np.arange(1.0, steps + 1), error=rng.random((1, steps, 3)),
             covariance=np.tile(np.eye(3), (1, steps, 1, 1)),
         )  # fmt: skip
         verdict = replace(track.verdict, scale=scale, location=location)
@@ -944,12 +944,12 @@ def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(repo
     scale = replace(track.verdict.scale, median_run=2.5, worst_run=3e4, mean_anees=4321.0)
     verdict = replace(track.verdict, scale=scale)
     far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
-    changed = replace(study, tracks=(far, *study.tracks[1:]))
-    curves = anees.read(changed).curves
+    with_far = replace(study, tracks=(far, *study.tracks[1:]))
+    curves = anees.read(with_far).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
     others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
     assert_allclose(curves[0].others, others.filled(np.nan))
-    (figure,) = anees.anees_curves(changed)
+    (figure,) = anees.anees_curves(with_far)
     assert f" 2 runs of {verdict.runs} decide the average of {track.name}, 4321 over all steps" in figure.caption
     (axes,) = panels(figure)
     (thin,) = lines(axes, f"{track.name} without 2 runs")

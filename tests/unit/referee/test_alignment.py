@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import consistency as cs
 from consistency.commands.app import app
-from consistency.diagnostics import Settings, judge, make_record
+from consistency.diagnostics import Settings, TruthFit, judge, make_record
 from consistency.referee.diagnostics.questions import residuals_of_fit
 from consistency.referee.diagnostics.questions.residuals_of_fit import (
     _at_most,
@@ -170,7 +170,7 @@ def test_only_judged_axes_decide(rng):
     away = moved(replace(p, covariance=P), WORLD["yaw"])
     found = aligned("est", [away], "posyaw", [0, 1, 5])
     assert_allclose(found.runs[0].errors()[:, [0, 1, 5]], 0.0, atol=1e-8)
-    assert "a frame of 3 degrees of freedom" in found.caption
+    assert "a frame of 3 degrees of freedom" in found.fit.caption
 
 
 def test_broken_estimates_do_not_move_the_others(rng):
@@ -372,20 +372,20 @@ def test_nothing_makes_up_for_a_frame_of_runs_that_oscillate(rng):
     found = aligned("est", runs, "posyaw", range(3))
     for back, p in zip(found.runs, runs, strict=True):
         assert_allclose(np.linalg.det(back.covariance), np.linalg.det(p.covariance), rtol=1e-9)
-    assert found.reduced
-    assert found.unavailable == ALL_BUT_SCALE
-    assert 0.3 < found.unseen < 0.6  # half of the NEES of a wave, and a little more where noise makes it so
+    assert found.fit.reduced
+    assert found.fit.unavailable == ALL_BUT_SCALE
+    assert 0.3 < found.fit.unseen < 0.6  # half of the NEES of a wave, and a little more where noise makes it so
     assert "the errors alternate or oscillate; nothing makes up" in found.notes[1]
-    assert f"at most about {100 * found.unseen:.2g} % of the NEES)" in found.caption
+    assert f"at most about {100 * found.fit.unseen:.2g} % of the NEES)" in found.fit.caption
 
 
 def test_a_frame_of_all_runs_leaves_no_bias_of_errors_that_cancel(rng):
     found = aligned("est", with_waves(rng, 24, 20), "posyaw-all", range(3))
-    assert found.unavailable == BIAS
-    assert "nor is a bias: the errors cancel over each run" in found.caption
+    assert found.fit.unavailable == BIAS
+    assert "nor is a bias: the errors cancel over each run" in found.fit.caption
     white = aligned("est", [run_of(rng, "planar", "so2", steps=20) for _ in range(24)], "posyaw-all", range(3))
-    assert white.unavailable == ()  # its ratio of 0.7 to 1.1 stays below 1.25
-    assert white.unseen == 0.0
+    assert white.fit.unavailable == ()  # its ratio of 0.7 to 1.1 stays below 1.25
+    assert white.fit.unseen == 0.0
 
 
 def test_what_a_frame_may_have_taken_is_added_before_consistent_is_said(rng):
@@ -426,7 +426,7 @@ def test_first_poses_are_made_true(kind, convention, rng):
     found = aligned("est", [moved(p, WORLD[kind])], "origin", range(len(SIGMA[kind])))
     (back,) = found.runs
     assert_allclose(back.errors()[0], 0.0, atol=1e-8)
-    assert not found.reduced
+    assert not found.fit.reduced
     assert_allclose(np.linalg.det(back.covariance[1:]), np.linalg.det(p.covariance[1:]), rtol=1e-6)
 
 
@@ -449,7 +449,7 @@ def test_what_an_uncertain_first_pose_adds_is_bounded(kind, convention, rng):
     ratios = linalg.eigvalsh(opposite @ opposite.T, found.runs[0].covariance[k])
     assert ratios.max() <= 1.0 + 1e-3
     assert ratios.max() > 0.3
-    assert found.reduced
+    assert found.fit.reduced
     assert "the first pose is not exact" in found.notes[1]
     assert not (found.runs[0].covariance[0]).any()
 
@@ -566,7 +566,7 @@ def test_clock_and_frame_are_found_in_turn_until_the_clock_settles(shifts, said,
     then = iter(shifts)
     monkeypatch.setattr(residuals, "frames_of", lambda *_: [])
     monkeypatch.setattr(residuals, "clock_shift", lambda *_: (next(then), []))
-    monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([]))
+    monkeypatch.setattr(residuals, "aligned", lambda *_: Aligned([], TruthFit()))
     assert clocks_and_frames("est", [], "estimate", "posyaw", range(3))[0] == said
 
 

@@ -9,6 +9,6 @@ OF_SETTINGS = {field.name for field in fields(Settings)}
 
 
 def judge(name, error=None, covariance=None, **options):
-    """``judge(Record(name, ...), Settings(...))``."""
+    """``judge(make_record(name, ...), Settings(...))``."""
     settings = {key: options.pop(key) for key in OF_SETTINGS & set(options)}
     return judge_evidence(make_record(name, error, covariance, **options), Settings(**settings))

@@ -97,13 +97,13 @@ def test_the_question_of_the_document_is_asked(copy):
         """
 import numpy as np
 from scipy import stats
-from consistency.diagnostics import Record, judge
+from consistency.diagnostics import judge, make_record
 
 n = 200
 size = np.sqrt(stats.chi2.ppf((np.arange(n) + 0.5) / n, 1))  # errors of a right estimator by their size
 for order in (np.arange(n), np.arange(n) * 37 % n):
     error = (size * np.resize([1, -1, -1, 1], n))[order].reshape(n, 1, 1)
-    v = judge(Record("f", error=error, covariance=np.ones((n, 1, 1, 1)), nees=error[..., 0] ** 2, dof=1))
+    v = judge(make_record("f", error=error, covariance=np.ones((n, 1, 1, 1)), nees=error[..., 0] ** 2, dof=1))
     print(v.faults, v.reasons[0], "trend" in [a["question"] for a in v.statistics["answers"]])
 """,
     )

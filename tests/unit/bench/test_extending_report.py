@@ -30,7 +30,7 @@ def test_the_section_with_one_plot_is_in_both_reports(uvd, tmp_path, example):
     cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=3, seed=0, jobs=1).write(tmp_path / "run")
     report = build_report(tmp_path / "run")
     (study,) = report.studies
-    error = study.tracks[0].record().in_world.error
+    error = study.tracks[0].record().in_world.errors.error
     expected = np.sqrt((error[..., :2] ** 2).sum(-1).mean(axis=0))
     assert_allclose(example.rmse(study.tracks[0]), expected)
 

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from consistency.diagnostics import Record, compare, judge, summary
+from consistency.diagnostics import compare, judge, make_record, summary
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 
 
@@ -35,7 +35,7 @@ def nees(runs, factor=1.0):
 def nees_with(p, runs):
     """NEES just so much too large that the verdict's p value is p."""
     def excess(log_factor):
-        return np.log(judge(Record("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
+        return np.log(judge(make_record("", nees=nees(runs, np.exp(log_factor)), dof=3)).p_value / p)
     return nees(runs, np.exp(optimize.brentq(excess, 0.01, 1.5)))
 
 

@@ -8,7 +8,7 @@ from consistency.referee.types import Array
 
 def rmse(track: Track) -> Array:
     """Root mean square error of the position over all runs in each step, (T,), m; NaN without estimate."""
-    error = track.record().in_world.error  # (runs, T, 3)
+    error = track.record().in_world.errors.error  # (runs, T, 3)
     squared = (error[..., :2] ** 2).sum(axis=-1)
     count = np.isfinite(squared).sum(axis=0)
     mean = np.nansum(squared, axis=0) / np.maximum(count, 1)

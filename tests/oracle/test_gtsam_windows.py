@@ -46,6 +46,6 @@ def test_joint_marginals_of_keyframes_agree_with_independent_motions(tmp_path, r
         covariance_order="rotation-translation",
     )  # fmt: skip
     motions = cs.read(tmp_path / "motions.tum", tmp_path / "truth.tum", relative=APART, motions=True)
-    assert_allclose(poses.error, motions.error, atol=1e-9)
-    assert_allclose(poses.covariance, motions.covariance, rtol=1e-6, atol=1e-12)
-    assert_allclose(poses.nees, motions.nees, rtol=1e-6)
+    assert_allclose(poses.errors.error, motions.errors.error, atol=1e-9)
+    assert_allclose(poses.errors.covariance, motions.errors.covariance, rtol=1e-6, atol=1e-12)
+    assert_allclose(poses.errors.nees, motions.errors.nees, rtol=1e-6)

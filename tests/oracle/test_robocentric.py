@@ -627,7 +627,7 @@ def test_a_long_return_is_found_or_left_out():
         which = inverse_range.Corrections(waiting=waiting)
         nees = record_of(
             cs.run_trials(scenario, [rc.compiled(textbook.RobotCentredKalman("trial", which))], 40, 5, 1), "trial"
-        ).nees
+        ).errors.nees
         lost.append(int((nees[:, -1] > 100.0).sum()))
     assert lost[0] == 0
     assert lost[1] > 0
@@ -648,7 +648,7 @@ def test_a_return_whose_place_is_hardly_known_finds_the_robot():
         which = inverse_range.Corrections(tempering=tempering, waiting=tempering)
         filter_ = rc.compiled(textbook.RobotCentredKalman("trial", which))
         runs = cs.run_trials(scenario, [filter_], 100, 778, 1)
-        nees = record_of(runs, "trial").nees
+        nees = record_of(runs, "trial").errors.nees
         lost.append(int((nees[:, -1] > 300.0).sum()))
         trial = cs.simulate(scenario, run=3, seed=778)
         ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
@@ -690,7 +690,7 @@ def test_where_the_heading_is_little_known_a_return_tells_nothing_of_the_world()
         filter_ = rc.compiled(
             textbook.RobotCentredKalman("trial", inverse_range.Corrections(adrift=adrift, waiting=adrift))
         )
-        nees = record_of(cs.run_trials(scenario, [filter_], 100, 779, 1), "trial").nees
+        nees = record_of(cs.run_trials(scenario, [filter_], 100, 779, 1), "trial").errors.nees
         ratio.append(float(np.median(nees[:, -1])) / 3.0)
         ours, twin = filter_.run(trial, scenario.belief), step_through(filter_.textbook, trial, scenario.belief)
         sigma = np.sqrt(np.einsum("kii->ki", twin.covariance))

@@ -55,22 +55,22 @@ def off(request):
 
 def anees_holds(c, step):
     low, high = cs.anees_interval(3, RUNS, 1 - ALPHA)
-    return bool(low <= c.nees[:, step - 1].mean() <= high)
+    return bool(low <= c.errors.nees[:, step - 1].mean() <= high)
 
 
 def nis_sum_holds(c):
-    low, high = stats.chi2.interval(1 - ALPHA, c.nis_dof.sum())
-    return bool(low <= np.nansum(c.nis) <= high)
+    low, high = stats.chi2.interval(1 - ALPHA, c.innovations.nis_dof.sum())
+    return bool(low <= np.nansum(c.innovations.nis) <= high)
 
 
 def nis_of_runs_holds(c):
     """The NIS of a run is chi-square with its degrees of freedom, independently of other runs."""
-    p = stats.chi2.cdf(np.nansum(c.nis, axis=1), c.nis_dof.sum(axis=1))
+    p = stats.chi2.cdf(np.nansum(c.innovations.nis, axis=1), c.innovations.nis_dof.sum(axis=1))
     return bool(stats.kstest(p, "uniform").pvalue > ALPHA)
 
 
 def nees_of_runs_holds(c):
-    return bool(stats.kstest(c.nees[:, -1], stats.chi2(3).cdf).pvalue > ALPHA)
+    return bool(stats.kstest(c.errors.nees[:, -1], stats.chi2(3).cdf).pvalue > ALPHA)
 
 
 def test_no_run_fails_and_only_the_first_step_is_left_out(results, kf):

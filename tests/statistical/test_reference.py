@@ -19,7 +19,7 @@ def summary(folder):
     for path in sorted(folder.glob("*/estimates.parquet")):
         results = cs.read_results(path.parent)
         out[path.parent.name] = {
-            name: [verdict.status, float(np.median(np.nanmean(record_of(results, name).nees, axis=1)))]
+            name: [verdict.status, float(np.median(np.nanmean(record_of(results, name).errors.nees, axis=1)))]
             for name, verdict in cs.analyse(results).items()
         }
     return out

@@ -75,9 +75,9 @@ def nees_of_runs_holds(c):
 
 def test_no_run_fails_and_only_the_first_step_is_left_out(results, kf):
     assert len(results.failures) == 0
-    assert kf.nees.shape == (RUNS, STEPS)
-    assert np.isnan(kf.nees[:, 0]).all()
-    assert np.isfinite(kf.nees[:, 1:]).all()
+    assert kf.errors.nees.shape == (RUNS, STEPS)
+    assert np.isnan(kf.errors.nees[:, 0]).all()
+    assert np.isfinite(kf.errors.nees[:, 1:]).all()
 
 
 @pytest.mark.parametrize("step", CHECKPOINTS)

@@ -171,8 +171,7 @@ def _ended(record: Record, failures: Sequence[Failure]) -> Record:
     gone = _gone(record)
     assert gone is not None
 
-    steps_alone = replace(record, runs=replace(record.runs, numbers=None))
-    return replace(steps_alone.changed(partial(_without, gone)), runs=record.runs)
+    return replace(record.changed(partial(_without, gone)), runs=record.runs)
 
 
 def _without(gone: Array, array: Array) -> Array:

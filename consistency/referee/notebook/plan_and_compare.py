@@ -120,7 +120,7 @@ def verdict_table(verdicts: Mapping[str, Verdict] | Iterable[Verdict]) -> pd.Dat
     -------
     pandas.DataFrame
         ``verdict``, ``runs``, ``steps``, ``anees`` and its expected value, ``ratio`` of true to stated covariance with
-        the ends of its interval, ``worst_axis``, ``failed`` runs and ``faults``; NaN where there is no truth
+        the ends of its interval, ``worst_axis``, ``failed`` runs and ``faults``; NaN without a truth
     """
     import pandas as pd
 

@@ -81,7 +81,7 @@ def read(
     estimates : .csv, .parquet, .npz, a TUM trajectory, or a folder of these with one for each run; or a table in
         memory, as a DataFrame, with the columns of a .csv
     truth : of the same kind, or the folder of a KITTI drive; not with .npz. "repeats": all runs have the same true
-        values, and there is no truth
+        values, which nobody knows
     covariance : of a TUM trajectory: t and 36 or 21 numbers
     error : error that the covariance describes: so2, vector, left, right, so3, so3-body, rvec or euler; None is
         the default, and "guess" judges all that poses have
@@ -169,7 +169,7 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
     Raises
     ------
     InputError
-        There is no such file, its kind is unknown, or there is no such option.
+        The file is missing, or its kind or an option is unknown.
     """
     for name in options:
         if name not in (there := [each.name for each in OPTIONS]):

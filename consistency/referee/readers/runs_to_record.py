@@ -218,8 +218,7 @@ def with_failed_runs(record: Record, failed: Mapping[int, str]) -> Record:
         nothing = np.full((len(failed), *array.shape[1:]), np.nan)
         return np.concatenate([array, nothing])[order]
 
-    numbered = replace(record, runs=replace(record.runs, numbers=None), groups=None)
-    longer = numbered.changed(with_rows)
+    longer = replace(record, groups=None).changed(with_rows)
     failures = list(record.failures)
     for run, reason in failed.items():
         failures.append(Failure(record.name, run, 1, reason))

@@ -116,7 +116,7 @@ def inspect(path: Path, r: Reading | None = None) -> Inspection:
     Raises
     ------
     InputError
-        There is no such file, its kind is unknown, or it cannot be opened.
+        The file is missing, its kind is unknown, or it cannot be opened.
     """
     r = r or Reading()
     if not path.exists():

@@ -311,7 +311,7 @@ def in_pieces(record: Record, count: int | None = None) -> Record:
         f"{record.name}: the log is cut into {pieces} pieces of {length} steps, treated as runs; its errors last "
         f"over {memory.time:.3g} steps"
     )
-    runs = replace(record.runs, numbers=None, times=None)
+    runs = replace(record.runs, times=None)
     of_pieces = replace(record, runs=runs, truth=replace(record.truth, covariance=None)).changed(
         lambda array: array[0, log.start : end].reshape(pieces, length, *array.shape[2:])
     )

@@ -307,12 +307,16 @@ class Record:
         return replace(self, innovations=replace(self.innovations, optimal_gain=True))
 
     def changed(self, change: Callable[[Any], Any]) -> Record:
-        """The record with ``change`` applied to each of its arrays over runs, (runs, ...), and to its groups."""
+        """The record with ``change`` applied to each of its arrays over runs and steps, and to its groups.
+
+        Numbers of the runs stay; those of other runs are given by the caller.
+        """
+        unnumbered = replace(self.runs, numbers=None)
         return replace(
             self,
             errors=_changed(self.errors, change),
             innovations=_changed(self.innovations, change),
-            runs=_changed(self.runs, change),
+            runs=replace(_changed(unnumbered, change), numbers=self.runs.numbers),
             truth=_changed(self.truth, change),
             groups=None if self.groups is None else replace(self.groups, index=change(self.groups.index)),
             origin=_changed(self.origin, change),
@@ -321,11 +325,11 @@ class Record:
 
     def of_runs(self, rows: slice | Indices) -> Record:
         """Some of the runs, by their rows, with maps and rejections of all."""
-        numbers = self.run_numbers
-        some = replace(self, runs=replace(self.runs, numbers=numbers)).changed(lambda array: array[rows])
-        failures = tuple(failure for failure in self.failures if failure.run in numbers[rows])
+        numbers = self.run_numbers[rows]
+        some = self.changed(lambda array: array[rows])
+        failures = tuple(failure for failure in self.failures if failure.run in numbers)
         guesses = {kind: one.of_runs(rows) for kind, one in self.guesses.items()}
-        return replace(some, failures=failures, guesses=guesses)
+        return replace(some, runs=replace(some.runs, numbers=numbers), failures=failures, guesses=guesses)
 
     def first_runs(self, runs: int) -> Record:
         """Runs 0 to ``runs`` - 1."""
@@ -388,8 +392,7 @@ class Record:
         for place in at:
             there[place] = True
         failed = (replace(f, run=int(number[place]), step=1) for place, f in zip(at, self.failures, strict=True))
-        unnumbered = replace(self, runs=replace(self.runs, numbers=None))
-        found = unnumbered.changed(lambda array: array[there][:, None])
+        found = self.changed(lambda array: array[there][:, None])
         unit = "row" if self.origin.window is None else "window"
         runs = Runs(number[there], unit, np.full(1, np.nan), found.runs.times, found.runs.by, skipped=self.runs.skipped)
         return replace(found, runs=runs, failures=tuple(failed), origin=replace(found.origin, files={}))

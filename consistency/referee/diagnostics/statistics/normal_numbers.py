@@ -212,7 +212,7 @@ def of_ensemble(record: Record, N: int) -> Record:
     Raises
     ------
     InputError
-        There are no errors with covariances.
+        The record has no errors with covariances.
     """
     if record.errors.error is None or record.errors.covariance is None:
         raise InputError(f"--ensemble {N}: {record.name} needs errors with covariances; NEES alone have lost them")
@@ -262,7 +262,7 @@ def of_repeats(record: Record) -> Record:
     Raises
     ------
     InputError
-        There are no errors with covariances, or fewer than two runs.
+        The record has no errors with covariances, or fewer than two runs.
     """
     if record.errors.error is None or record.errors.covariance is None or len(record.errors.error) < 2:
         raise InputError(f"--truth repeats: {record.name} needs estimates of 2 runs or more, with covariances")

@@ -95,6 +95,11 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     return [replace(one, convention=r.error or "", definition=definition)]
 
 
+def first_known(repeats: Array) -> Array:
+    """A value for each step of repeats (runs, steps, n), (1, steps, n): that of the first run that has one."""
+    return np.take_along_axis(repeats, np.argmax(np.isfinite(repeats), axis=0)[None], axis=0)
+
+
 def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
     """Places of steps of a run in arrays."""
     return Places(lambda row: f"{of}, run {run}, step {row + 1}", rows)
@@ -123,8 +128,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         return _of_members(archive, r)
     if kind == OF_REPEATS:
         states = archive.array("estimates", 3)
-        first = np.take_along_axis(states, np.argmax(np.isfinite(states), axis=0)[None], axis=0)  # any value would do
-        arrays = {**arrays, "truth": np.nan_to_num(np.broadcast_to(first, states.shape))}
+        arrays = {**arrays, "truth": np.nan_to_num(np.broadcast_to(first_known(states), states.shape))}
         archive = Archive(path, arrays)
     if kind != OF_NEES:
         require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")

@@ -16,7 +16,7 @@ from consistency.referee.diagnostics.records.whitening import diagonal
 from consistency.referee.diagnostics.words.numbers import is_or_are
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
-from consistency.referee.readers.formats.archives import estimator_of_arrays, require_layout
+from consistency.referee.readers.formats.archives import estimator_of_arrays, first_known, require_layout
 from consistency.referee.readers.options import Reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.truth_matching import Estimator
@@ -77,8 +77,7 @@ def record_of_arrays(
         raise InputError(text)
     if are_repeats:
         own = arrays.pop(first)
-        begin = np.take_along_axis(own, np.argmax(np.isfinite(own), axis=0)[None], axis=0)
-        arrays = {"errors": begin - own, **arrays}  # from any one value: what all share is lost
+        arrays = {"errors": first_known(own) - own, **arrays}  # from any one value: what all share is lost
     sigma = arrays.pop("deviations", None)
     if sigma is not None:
         if sigma.shape != shape:

@@ -201,6 +201,36 @@ def test_p_value_of_the_curve_is_where_it_would_leave_its_band(fresh, method, al
         assert not simultaneous_band(nees, 3, min(p * 0.999, 0.99), method, allow).outside.any()
 
 
+@pytest.mark.parametrize("decimals", [1, 2, 3])
+@pytest.mark.parametrize("runs", [1, 2])
+def test_errors_of_few_decimals_are_not_too_small(decimals, runs):
+    """False-alarm rate of all cases together: 6 times 20 draws at 1e-6."""
+    zeros = 0
+    for seed in range(20):
+        errors = np.random.default_rng([decimals, runs, seed]).standard_normal((runs, 2000))
+        nees = np.round(errors, decimals) ** 2
+        zeros += (nees == 0).sum()
+        band = simultaneous_band(nees, 1, 1e-6)
+        assert not band.below.any()
+        assert band.p_value > 1e-6
+    assert zeros
+
+
+@pytest.mark.parametrize("zero", [0.0, 1e-15])
+@pytest.mark.parametrize("runs", [2, 20])
+def test_a_start_that_is_known_in_all_runs_is_too_small(runs, zero):
+    nees = np.random.default_rng(runs).chisquare(3, (runs, 200))
+    nees[:, 0] = zero
+    band = simultaneous_band(nees, 3, 1e-3)
+    assert band.below.nonzero()[0].tolist() == [0]
+    assert band.p_value < 1e-3
+
+
+def test_errors_that_are_all_zero_are_too_small():
+    assert simultaneous_band(np.zeros((5, 20)), 3, 1e-3).below.all()
+
+
+
 # --- bias ----------------------------------------------------------------------------------------------
 
 # Johnson & Wichern (2007) Table 5.1: sweat rate, sodium, potassium of 20 women; Example 5.3: T^2 = 9.74

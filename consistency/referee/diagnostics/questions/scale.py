@@ -39,6 +39,7 @@ UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 NOTHING = (float("nan"), float("nan"))
 FARTHEST = 15.0  # log of a ratio, beyond which an interval has no end
 HALVINGS = 16  # of an interval in which an end is looked for
+ZERO = 1e-12  # NEES of errors that differ from 0 by the rounding of numbers alone
 
 
 @dataclass(frozen=True)
@@ -610,6 +611,9 @@ def simultaneous_band(
     less than the NEES of a run that has both steps: rho_k is that times s / sqrt(N_k N_k+1), where s of the N_k and
     N_k+1 runs are in both.
 
+    An error that is written with few decimals may be 0. For the lower side such a NEES counts as the smallest that is
+    not 0, so that a step is not "too small" by rounding alone.
+
     Parameters
     ----------
     nees : (runs, steps), NaN where a run has no value
@@ -642,10 +646,11 @@ def simultaneous_band(
 
     c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
     curve = anees(nees)
+    least = curve + _rounded_to_zero(nees) / np.maximum(alive, 1)
     k = alive[judged] * dof
     upper, lower = (
         distributions.chi2.sf(alive[judged] * curve[judged], k),
-        distributions.chi2.cdf(alive[judged] * curve[judged], k),
+        distributions.chi2.cdf(alive[judged] * least[judged], k),
     )
     smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
     p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
@@ -656,7 +661,15 @@ def simultaneous_band(
         low[judged] = 0.0
     high[judged] = (distributions.chi2.isf(special.ndtr(-c), counts * dof) / counts)[of_step]
     with np.errstate(invalid="ignore"):
-        return Band(low, high, p_value, curve > high, curve < low)
+        return Band(low, high, p_value, curve > high, least < low)
+
+
+def _rounded_to_zero(nees: Array) -> Array:
+    """What the zeros of each step of (runs, steps) add up to, each taken as the smallest NEES that is not 0, (steps,)."""
+    with np.errstate(invalid="ignore"):
+        smallest = float(np.min(nees, initial=np.inf, where=nees > ZERO))
+        zeros = (nees <= ZERO).sum(axis=0)
+    return np.asarray(zeros * smallest if np.isfinite(smallest) else 0.0 * zeros)
 
 
 def _slopes(nees: Array) -> Array:

@@ -647,14 +647,14 @@ def simultaneous_band(
     c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
     curve = anees(nees)
     least = curve + _rounded_to_zero(nees) / np.maximum(alive, 1)
-    k = alive[judged] * dof
-    upper, lower = (
-        distributions.chi2.sf(alive[judged] * curve[judged], k),
-        distributions.chi2.cdf(alive[judged] * least[judged], k),
-    )
+    counts, of_step = np.unique(alive[judged], return_inverse=True)
+    highest, lowest = np.full(len(counts), -np.inf), np.full(len(counts), np.inf)
+    np.maximum.at(highest, of_step, curve[judged])
+    np.minimum.at(lowest, of_step, least[judged])
+    upper = distributions.chi2.sf(counts * highest, counts * dof)
+    lower = distributions.chi2.cdf(counts * lowest, counts * dof)
     smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
     p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
-    counts, of_step = np.unique(alive[judged], return_inverse=True)
     if sides == 2:
         low[judged] = (distributions.chi2.ppf(special.ndtr(-c), counts * dof) / counts)[of_step]
     else:

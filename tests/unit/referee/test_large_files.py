@@ -19,6 +19,13 @@ from consistency.referee.readers.runs_to_record import symmetric
 LAYOUT = "t and two numbers"
 
 
+@pytest.fixture(params=["by numpy", "by pyarrow"], autouse=True)
+def reader_of_numbers(request, monkeypatch):
+    """Numbers of a short file are read as those of a large one, too."""
+    if request.param == "by pyarrow":
+        monkeypatch.setattr(text_blocks, "LARGE", -1)
+
+
 @contextmanager
 def blocks_of(size):
     with mock.patch.object(text_blocks, "BLOCK", size):
@@ -87,6 +94,14 @@ def test_numbers_in_blocks_are_those_line_by_line(name, tmp_path):
     assert isinstance(whole, str) == (name in refused.split(", "))
     if not isinstance(whole, str):
         assert_equal(whole, line_by_line(NUMBERS[name]))
+
+
+def test_every_number_of_many_lines_is_read_to_the_last_bit(tmp_path):
+    values = np.random.default_rng(3).standard_normal((2000, 3)).cumsum(axis=0)
+    values[:, 0] = np.arange(2000)
+    path = tmp_path / "a.txt"
+    path.write_text("".join(" ".join(map(repr, row)) + "\n" for row in values.tolist()), encoding="utf-8")
+    assert_array_equal(read_numbers(path, (3, 4), LAYOUT).values, values)
 
 
 def test_the_line_of_a_fault_far_down_is_named(tmp_path):

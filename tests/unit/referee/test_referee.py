@@ -230,7 +230,6 @@ def test_errors_that_are_all_zero_are_too_small():
     assert simultaneous_band(np.zeros((5, 20)), 3, 1e-3).below.all()
 
 
-
 # --- bias ----------------------------------------------------------------------------------------------
 
 # Johnson & Wichern (2007) Table 5.1: sweat rate, sodium, potassium of 20 women; Example 5.3: T^2 = 9.74

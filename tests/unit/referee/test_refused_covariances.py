@@ -72,6 +72,22 @@ def test_a_negative_deviation_is_called_one(deviation, rng):
     assert verdict.failures[0].reason.startswith("a standard deviation is not above 0")
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_diagonal_with_a_negative_number_does_not_hold_deviations(sign, rng, tmp_path, capsys):
+    sigma = rng.uniform(0.02, 0.5, (RUNS, STEPS))
+    errors = sigma * rng.standard_normal((RUNS, STEPS))
+    sigma[3, 4] *= sign
+    est, true = ["run,t,x,P_x_x"], ["run,t,x"]
+    for run in range(RUNS):
+        est += [f"{run},{k},{k + errors[run, k]:.9f},{sigma[run, k]:.9f}" for k in range(STEPS)]
+        true += [f"{run},{k},{k}" for k in range(STEPS)]
+    (tmp_path / "est.csv").write_text("\n".join(est), encoding="utf-8")
+    (tmp_path / "true.csv").write_text("\n".join(true), encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main(["analyse", str(tmp_path / "est.csv"), "--truth", str(tmp_path / "true.csv"), "--state", "x"])
+    assert ("its diagonal holds standard deviations" in capsys.readouterr().out) == (sign > 0)
+
+
 def write_poses(path, rng, jitter, wander, drives=6, rows=200):
     """Estimates and truth of a camera; errors of each row by itself, and a wander that ends nowhere."""
     for name in ("est", "true"):

@@ -101,6 +101,14 @@ def test_failed_runs_and_a_known_start(rng):
     assert (verdict.lost.count, verdict.lost.runs) == (2, 60)
 
 
+def test_failed_runs_are_told_once_beside_the_faults_of_parts(rng):
+    error = 3.0 * correlated(rng)
+    error[4, 5] = np.nan
+    sentence = of_deviations(error).reasons[0]
+    assert sentence.count("x: covariance too small") == sentence.count("y: covariance too small") == 1
+    assert sentence.count("1 of 60 runs failed") == 1
+
+
 def test_parts_of_several_components_use_their_cross_terms(rng):
     """x and y with their correlation, z by itself."""
     error = correlated(rng)

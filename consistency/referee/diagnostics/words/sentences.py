@@ -70,7 +70,7 @@ def _faults_of_parts(v: Findings) -> str:
     texts = []
     for name, part in v.parts.items():
         if part.faults:
-            part = _at_one_level(v, name, part)
+            part = replace(_at_one_level(v, name, part), failures=())  # which are those of the whole
             sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
             texts.append(f"{name}: {sentence}")
     if len(texts) > MOST:

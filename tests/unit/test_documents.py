@@ -129,11 +129,12 @@ def test_make_has_the_target(command):
 def test_pip_installs_what_there_is(command):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     *_, what = command.words
-    if " @ " in what:
-        assert what == f"{project['name']} @ git+{project['urls']['Repository']}"
-        return
+    what, _, address = what.partition(" @ ")
     name, _, extras = what.partition("[")
-    assert name == "."  # the project is on no index
+    if address:
+        assert (name, address) == (project["name"], f"git+{project['urls']['Repository']}")
+    else:
+        assert name == "."  # the project is on no index
     assert set(extras.rstrip("]").split(",")) - {""} <= set(project["optional-dependencies"])
 
 

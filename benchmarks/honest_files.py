@@ -25,7 +25,7 @@ from script_options import options_of
 from consistency.diagnostics import Verdict, judge
 from consistency.referee.geometry import composed, vectors
 from consistency.referee.readers.formats.positions import axes_at, centred, geodetic
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.types import Array
 from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch
@@ -354,7 +354,7 @@ def verdicts(row: str, rng: np.random.Generator, ratio: float) -> list[tuple[boo
             return [(alarm is not None, alarm is not None and alarm.direction == "overconfident")]
         if "truth" in options and ROWS[row] not in (planar, rates):
             options["time_offset"] = 0.0  # spares the search for another clock, which changes no verdict
-        found: list[Verdict] = [judge(record) for record in read_recordings(path, Reading(**options))]
+        found: list[Verdict] = [judge(record) for record in read_recordings(path, make_reading(**options))]
     return [(bool(each.faults), each.status == "overconfident") for each in found]
 
 

@@ -80,8 +80,6 @@ def fit_covariance_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing folder of --out.")] = False,
 ) -> None:
     """Fit a covariance to odometry that states none. Judge it on other drives."""
-    from dataclasses import replace
-
     from consistency.referee.fit_covariance.drives import read_drives
     from consistency.referee.fit_covariance.noise_model import fit_covariance as fit
     from consistency.referee.fit_covariance.noise_model import noise_document
@@ -91,7 +89,7 @@ def fit_covariance_command(
     require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "noise")
-    drives = read_drives(path, reading=replace(files, motions=motions or None))
+    drives = read_drives(path, reading=files.with_options(motions=motions or None))
     other = None if second is None else read_drives(second, reading=files)
     mean = not (keep_mean_error or no_correct)
     model = fit(
@@ -150,8 +148,6 @@ def correct_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
     """Find factors for a stated covariance, or variances where none is. Judge them on runs that chose nothing."""
-    from dataclasses import replace
-
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.system.folders import require_free
@@ -162,9 +158,10 @@ def correct_command(
     require_written(overwrite, out, "--out")
     if out is not None:
         require_free(out, overwrite, "correction")
-    if per is not None and files.align not in (None, "none", "origin"):
-        raise InputError(f"--per axis: does not go with --align {files.align}, which turns the axes of the covariances")
-    files = replace(files, unstated=True)
+    align = files.matching.align
+    if per is not None and align not in (None, "none", "origin"):
+        raise InputError(f"--per axis: does not go with --align {align}, which turns the axes of the covariances")
+    files = files.with_options(unstated=True)
     records = read_files(path, files)
     record = the_record(records, name).without_first(skip_asked(skip))
     texts = text_files(path, files, record.name)

@@ -350,12 +350,12 @@ def compare_command(
     estimates = [each for each in sides if not is_baseline(each) and are_files(each, files)]
     if not estimates and (unread := files.given()):
         raise InputError(f"{flag_of(unread[0])}: is for files of another estimator, and none is named")
-    if len(estimates) == 2 and files.covariance is not None:
+    if len(estimates) == 2 and files.sources.covariance is not None:
         raise InputError(
             f"--covariance: would be read with {path} and with {other}; keep one of them with 'consistency baseline'"
         )
     read = {each: read_files(each, files) for each in estimates}
-    new, *old = (_summaries(each, read.get(each), first, files.truth) for each in sides)
+    new, *old = (_summaries(each, read.get(each), first, files.sources.truth) for each in sides)
     if old:
         compared = compare_with(new, old[0], filters or [], false_alarm)
     else:
@@ -399,7 +399,7 @@ def baseline_command(
         from consistency.bench.runs.results_to_records import results_source
 
         source = results_source(path)
-    write_baseline(summarise(source, str(path), skip, files.truth), out, overwrite)
+    write_baseline(summarise(source, str(path), skip, files.sources.truth), out, overwrite)
     tell_notes(recordings)
     print(f"baseline in {out}; next: consistency compare NEW {out}")
 

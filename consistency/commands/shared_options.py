@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import Field
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import OPTIONS, Reading, flag_of
+from consistency.referee.readers.options import OPTIONS, VALUES, Option, Reading, flag_of, make_reading
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.records.record import Record
@@ -159,18 +158,21 @@ def reads_files(
     if command is None:
         return partial(reads_files, only=only, without=without)
     signature = inspect.signature(command, eval_str=True)
-    hints = get_type_hints(Reading)
+    files = Reading()
+    kinds: dict[str, Any] = {}
+    for name in dict.fromkeys(VALUES.values()):
+        kinds |= get_type_hints(type(getattr(files, name)))
     taken = [each for each in OPTIONS if only is None or each.name in only]
     taken = [each for each in taken if each.name not in without]
-    own = {each.name: _parameter(each, hints[each.name]) for each in taken}
+    own = {each.name: _parameter(each, kinds[each.name]) for each in taken}
 
     @wraps(command)
     def with_files(**given: Any) -> Any:
         options = {each.name: given.pop(each.name) for each in taken}
         for each in taken:
-            if (parse := each.metadata["parse"]) is not None and options[each.name] is not None:
-                options[each.name] = parse(options[each.name])
-        return command(files=Reading(**options), **given)
+            if each.parse is not None and options[each.name] is not None:
+                options[each.name] = each.parse(options[each.name])
+        return command(files=make_reading(**options), **given)
 
     parameters = []
     for name, parameter in signature.parameters.items():
@@ -180,12 +182,11 @@ def reads_files(
     return with_files
 
 
-def _parameter(of: Field[Any], kind: Any) -> inspect.Parameter:
+def _parameter(of: Option, kind: Any) -> inspect.Parameter:
     """An option of files as typer takes it; what is parsed comes as text."""
-    m = of.metadata
-    completion = completed(lambda: m["values"]) if m["values"] else None
-    flag = m["flag"] or flag_of(of.name)
-    option = typer.Option(flag, help=m["help"], metavar=m["metavar"], show_default=False, autocompletion=completion)
-    typed = str | None if m["parse"] else kind
+    completion = completed(lambda: of.values) if of.values else None
+    flag = of.flag or flag_of(of.name)
+    option = typer.Option(flag, help=of.help, metavar=of.metavar, show_default=False, autocompletion=completion)
+    typed = str | None if of.parse else kind
     annotation = Annotated[typed, option]  # type: ignore[valid-type]
     return inspect.Parameter(of.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

@@ -12,7 +12,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import SPATIAL, se3_log, spatial_error, wrap
 from consistency.referee.readers.formats.sheet import read_sheet
 from consistency.referee.readers.mix_ups.hints import hints
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.readers.truth_matching import BRIDGED, truth_at
 from consistency.referee.verdicts.compare_sources import _known
@@ -68,7 +68,7 @@ def test_an_estimate_that_is_not_finite_is_a_failed_run(column, value, tmp_path)
     cells[header.split(",").index(column)] = value
     lines[8] = ",".join(cells)
     path.write_text("\n".join([header, *lines]))
-    [recording] = read_recordings(path, Reading(truth=tmp_path / "truth.csv"))
+    [recording] = read_recordings(path, make_reading(truth=tmp_path / "truth.csv"))
     [failure] = recording.failures
     assert (failure.run, failure.step) == (1, 3)
     assert failure.reason.startswith("estimate is not finite")

@@ -71,17 +71,18 @@ def read_drives(
     InputError
         Something cannot be used: names file, line, column or option, and what is allowed.
     """
-    r = reading or Reading(truth=None if truth is None else Path(truth))
+    r = reading or Reading().with_truth(None if truth is None else Path(truth))
     path = Path(estimates)
     if not path.exists():
         raise InputError(f"{path}: no such file")
-    if r.time_offset not in (None, "estimate") and not isinstance(r.time_offset, (int, float)):
-        raise InputError(f"--time-offset {r.time_offset}: must be a number of seconds, or 'estimate'")
+    offset = r.matching.time_offset
+    if offset not in (None, "estimate") and not isinstance(offset, (int, float)):
+        raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
     poses = _poses(path, r)
     require_radians(str(path), poses)
     found = [(each, _matrices(each, r)) for each in poses]
-    if r.time_offset != "estimate":
-        return [_drive(each, T, float(r.time_offset or 0.0)) for each, T in found]
+    if offset != "estimate":
+        return [_drive(each, T, float(offset or 0.0)) for each, T in found]
     shift = clock_offset(found)
     return [replace(_drive(each, T, shift), shift=shift) for each, T in found]
 
@@ -117,7 +118,7 @@ def drive_of(
 
 def _poses(path: Path, r: Reading) -> list[Poses]:
     """The poses of each drive, without covariances."""
-    if not is_bag(path) and path.is_dir() and not trajectory_files(path, r.columns):
+    if not is_bag(path) and path.is_dir() and not trajectory_files(path, r.components.columns):
         return _of_folder(path, r)
     kind = kind_of(path, r)
     if kind is None or is_solution(path):
@@ -143,7 +144,8 @@ def _of_one(path: Path, found: Found, r: Reading) -> list[Poses]:
 
 def _of_folder(folder: Path, r: Reading) -> list[Poses]:
     """Tables of a folder, one for each drive, with truths of the same names in another."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path, r.columns))
+    columns = r.components.columns
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in TABLES or is_plane(path, columns))
     if not files:
         raise InputError(f"{folder}: holds no tables, trajectories ({', '.join(TRAJECTORIES)}) or ROS bags")
     found = []
@@ -160,7 +162,7 @@ def _matrices(poses: Poses, r: Reading) -> Array:
     what = "the pose is not finite; end the drive before it, or leave the row out"
     refuse(~finite, poses.place.__getitem__, what)
     T = matrices(poses.estimate)
-    return composed(T) if r.motions else T
+    return composed(T) if r.runs.motions else T
 
 
 def _drive(poses: Poses, T: Array, shift: float) -> Drive:

@@ -20,7 +20,7 @@ from consistency.referee.diagnostics.records.record import InnovationRecord, Rec
 from consistency.referee.errors import InputError
 from consistency.referee.gating.session import Terms
 from consistency.referee.readers.formats.archives import steps_of
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, StatementOptions
 from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
 from consistency.referee.readers.pipeline.read_files import checked_options
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
@@ -59,7 +59,7 @@ def record_of_checked(
         raise ValueError(f"give {' or '.join(there)}, not both")
     key = there[0] if there else "covariances"
     size = sizes[key]
-    options = Reading(level=level, ends=ends)
+    options = Reading(statement=StatementOptions(level=level, ends=ends))
     if options.given() and bounds is None:
         raise ValueError("level and ends go with bounds")
     if errors is None and size is not None:

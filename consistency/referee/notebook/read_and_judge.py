@@ -19,7 +19,20 @@ from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import document, summary
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.formats.archives import UNWEIGHTED
-from consistency.referee.readers.options import OPTIONS, REPEATS, Reading
+from consistency.referee.readers.options import (
+    OPTIONS,
+    REPEATS,
+    ComponentOptions,
+    ConventionOptions,
+    GroupOptions,
+    MatchingOptions,
+    Reading,
+    RunOptions,
+    SourceOptions,
+    StatementOptions,
+    TruthOptions,
+    make_reading,
+)
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
@@ -131,15 +144,23 @@ def read(
     stated = None if covariance is None else Path(covariance)
     of_truth = None if truth_covariance is None else str(truth_covariance)
     reading = Reading(
-        truth=true, covariance=stated, error=error, state=state, covariance_order=covariance_order, max_dt=max_dt,
-        time_offset=time_offset, axes=axes, topic=topic, truth_topic=truth_topic, body=body, relative=relative,
-        motions=motions or None, windows=windows, independent=independent or None, align=align,
-        lever_arm=lever_arm, split=split, truth_covariance=of_truth, truth_errors=truth_errors,
-        truth_shared=truth_shared or None, level=level, gaussian=gaussian or None, ends=ends,
-        by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
-        columns=columns, truth_columns=truth_columns,
-        world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes, dof=dof,
-        members=members, ensemble=ensemble,
+        sources=SourceOptions(truth=true, covariance=stated, topic=topic, truth_topic=truth_topic, body=body),
+        conventions=ConventionOptions(
+            error=error, covariance_order=covariance_order,
+            world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes,
+        ),
+        components=ComponentOptions(
+            state=state, axes=axes, columns=columns, truth_columns=truth_columns, members=members
+        ),
+        matching=MatchingOptions(max_dt=max_dt, time_offset=time_offset, align=align, lever_arm=lever_arm),
+        runs=RunOptions(
+            relative=relative, motions=motions or None, windows=windows, independent=independent or None, split=split
+        ),
+        truth=TruthOptions(
+            truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None
+        ),
+        statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, dof=dof, ensemble=ensemble),
+        groups=GroupOptions(by=by, by_file=None if by_file is None else Path(by_file), bins=bins),
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates
@@ -177,7 +198,7 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
     given: dict[str, Any] = {
         name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()
     }
-    return inspect_file(Path(path), Reading(**given))
+    return inspect_file(Path(path), make_reading(**given))
 
 
 @naming_arguments
@@ -256,7 +277,7 @@ def judge(
         raise InputError(f"{', '.join(stated)}: give one of them beside errors")
     if "weights" in settings:
         raise InputError(f"weights: {UNWEIGHTED}")
-    options = Reading(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble)
+    options = Reading(statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble))
     if bounds is not None or options.given(("level", "gaussian", "ends")):
         options = checked_options(options)
     if members is not None:
@@ -271,7 +292,7 @@ def judge(
     elif stated:
         stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
         record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent, options)
-        options = Reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
+        options = Reading(truth=TruthOptions(truth_errors=truth_errors, truth_shared=truth_shared or None))
         require_truth_options(options)
         (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from consistency.referee.programs.process import (
     run_program,
     seed_of,
 )
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, make_reading
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
     ProgramRun,
@@ -199,7 +199,7 @@ def _run(
     program = program_of(argv, here, cwd)
     inputs = () if each is None else inputs_of(each, here)
     plan = Plan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
-    reading = Reading(**options)
+    reading = make_reading(**options)
     if out is not None:
         return run_study(program, plan, Path(out), estimates, reading, resume, overwrite)
     with tempfile.TemporaryDirectory(prefix="consistency-") as folder:
@@ -308,9 +308,9 @@ def _required(plan: Plan, r: Reading) -> Reading:
         raise InputError("--max-runs goes with --until-decided")
     if plan.inputs and (plan.runs is not None or plan.until_decided):
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
-    if r.error == GUESS:
+    if r.conventions.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
-    if r.level is not None and not r.gaussian:
+    if r.statement.level is not None and not r.statement.gaussian:
         raise InputError("--level: monte-carlo judges covariances; add --gaussian, or judge bounds of the kept runs "
                          "with 'consistency analyse'")  # fmt: skip
     if IS_WINDOWS:
@@ -327,7 +327,7 @@ def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> 
     if Path(filled(estimates, here)).is_absolute() and not any(part in estimates for part in OF_A_RUN):
         raise InputError(f"--estimates {estimates}: is one file for all runs; let the program write into {{out}}")
     for name in PATHS:
-        path = getattr(r, name)
+        path = r.option(name)
         if path is None:
             continue
         inputs = [here | {"input": str(each), "name": each.stem} for each in plan.inputs]
@@ -341,8 +341,7 @@ def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> 
 
 
 def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[str, Any]:
-    given = {each.name: getattr(r, each.name) for each in fields(r)}
-    reading = {name: str(value) if name in PATHS else value for name, value in given.items() if value is not None}
+    reading = {name: str(value) if name in PATHS else value for name, value in r.as_options().items()}
     here = program.here
     return {
         "program": program.name, "words": list(program.words),

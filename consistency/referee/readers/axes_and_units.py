@@ -84,13 +84,14 @@ def axes_of_files(r: Reading, in_space: bool) -> tuple[Axes, Axes]:
     A truth beside the estimates in their file has their axes. The body of a pose in the plane, unless declared, has its
     third axis where its world has it.
     """
-    beside = r.truth is None and r.truth_topic is None
-    world = r.world or ENU
-    own = Axes(world, r.body_axes or _body_of(world, in_space))
+    beside = not r.given(("truth", "truth_topic"))
+    declared = r.conventions
+    world = declared.world or ENU
+    own = Axes(world, declared.body_axes or _body_of(world, in_space))
     if beside:
-        return own, Axes(r.truth_world or own.world, r.truth_body_axes or own.body)
-    true_world = r.truth_world or ENU
-    return own, Axes(true_world, r.truth_body_axes or _body_of(true_world, in_space))
+        return own, Axes(declared.truth_world or own.world, declared.truth_body_axes or own.body)
+    true_world = declared.truth_world or ENU
+    return own, Axes(true_world, declared.truth_body_axes or _body_of(true_world, in_space))
 
 
 def _body_of(world: str, in_space: bool) -> str:

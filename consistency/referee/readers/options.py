@@ -1,13 +1,14 @@
-"""How files of another estimator are read: one record of options, for readers, commands and Python alike."""
+"""How files of another estimator are read: values of options, for readers, commands and Python alike.
 
-# ruff: noqa: RUF009  # an option is a field
+A field of a value has the name of its option. ``OPTIONS`` says how the command line shows each.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,116 +70,53 @@ def _bins(text: str) -> int | list[float]:
     return _lengths(text.strip().removesuffix(","))
 
 
-def _option(
-    help: str,
-    metavar: str | None = None,
-    parse: Callable[[str], Any] | None = None,
-    flag: str | None = None,
-    values: Sequence[str] = (),
-) -> Any:
-    """An option: how the command line shows it, and what it makes of a text."""
-    return field(
-        default=None, metadata={"help": help, "metavar": metavar, "parse": parse, "flag": flag, "values": values}
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
-class Reading:
-    """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them."""
+class SourceOptions:
+    """What is read beside the estimates, and which topics of a bag."""
 
-    truth: Path | None = _option("Truth like the estimates, KITTI drive, or 'repeats'.")
-    covariance: Path | None = _option("Covariances of a TUM trajectory: t, 36 or 21 numbers.")
-    error: str | None = _option(
-        "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
-        "guess.",
-        "ERROR",
-        values=ERRORS,
-    )
-    state: Sequence[str] | None = _option("Columns of the state [x,y,heading].", "A,B,C", _names)
-    covariance_order: str | None = _option(
-        "Order of the covariance: translation-rotation [default], rotation-translation, or blocks of p, R, v, bg, ba "
-        "such as p,v,R."
-    )
-    max_dt: float | None = _option(f"Maximum time between an estimate and its truth, s [{MAX_DT:g}].")
-    time_offset: float | str | None = _option(
-        "Seconds to add to the timestamps of the estimates.", "S|estimate", _seconds
-    )
-    axes: Sequence[str] | None = _option("Components of a trajectory to judge: x,y,yaw.", "A,B,C", _names)
-    topic: str | None = _option("Topic of the estimates in a ROS bag.")
-    truth_topic: str | None = _option("Topic of the truth in a ROS bag, or PARENT:CHILD, two frames of /tf.")
-    body: str | None = _option("Body that a KITTI drive as truth refers to: imu [default], velodyne or camera.")
-    relative: str | float | None = _option("Judge motions over windows: steps, seconds, metres.", "N|Ns|Nm", str)
-    motions: bool | None = _option(
-        "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"
-    )
-    windows: str | None = _option("'independent': treat each window as an independent run.")
-    independent: bool | None = _option("Each row, or window, is an independent run.", flag="--independent/")
-    align: str | None = _option(
-        "Move estimates into the world of the truth: none; origin, by the first pose of each run; posyaw or se3, by "
-        "a frame fitted to each run (posyaw-all, se3-all: to all).",
-        "MODE",
-        values=MODES,
-    )
-    lever_arm: Sequence[float] | None = _option(
-        "Point that a truth of positions measures, in the axes of the body, m.", "X,Y,Z", _lengths
-    )
-    split: str | int | None = _option("Split one log into N runs, taken as independent.", "auto|N", str)
-    truth_covariance: str | None = _option(
-        "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21 numbers.", "columns|FILE"
-    )
-    truth_errors: str | None = _option("Dependence of the truth's errors: independent, per-run, or common to all runs.")
-    truth_shared: bool | None = _option("Declare that the estimator has fused the truth.", flag="--truth-shared/")
-    level: str | float | Mapping[str, Any] | None = _option(
-        "Level of bounds and radii: 95%, 2sigma, CEP.", "LEVEL", str
-    )
-    gaussian: bool | None = _option(
-        "Read them (or deviations) at that --level as the covariance of a Gaussian, circular for radii.",
-        flag="--gaussian/",
-    )
-    ends: str | None = _option(
-        "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."
-    )
-    by: str | None = _option("Judge groups by this column, too: bins, or words.", "COLUMN")
-    by_file: Path | None = _option("Table with that column and t, run or both.")
-    bins: int | Sequence[float] | None = _option(
-        "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins
-    )
-    columns: Mapping[str, str] | None = _option(
-        "What columns of the estimates are called: x=pos_n,y=pos_e; P*=cov_* for all that begin alike.",
-        "NAME=COLUMN,…",
-        _columns,
-    )
-    truth_columns: Mapping[str, str] | None = _option(
-        "What columns of the truth are called, as --columns.", "NAME=COLUMN,…", _columns
-    )
-    world: str | None = _option("World axes of the estimates: enu [default], ned ...", "AXES")
-    body_axes: str | None = _option("Axes of the body of the estimates: flu [default], frd ...", "AXES")
-    truth_world: str | None = _option("Axes of the world of the truth [enu].", "AXES")
-    truth_body_axes: str | None = _option("Axes of the body of the truth [flu].", "AXES")
-    dof: int | None = _option("Degrees of freedom of each NIS of a table that has no column of them.", "N")
-    unstated: bool | None = None  # of no command line: the covariance is I where the files state none
-
-    members: Mapping[str, str] | None = _option(
-        "Columns of the members of an ensemble: x=e* for all that begin with e.", "NAME=COLUMN*,…", _columns_of_members
-    )
-    ensemble: int | None = _option("Number of members whose mean and sample covariance the files state.", "N")
+    truth: Path | None = None
+    covariance: Path | None = None
+    topic: str | None = None
+    truth_topic: str | None = None
+    body: str | None = None
 
     @property
     def repeats(self) -> bool:
         """Whether runs are repeats of the same true values, and no file is called so."""
         return self.truth == Path(REPEATS) and not Path(REPEATS).exists()
 
-    def given(self, names: Sequence[str] | None = None) -> list[str]:
-        """Options among ``names``, or among all, that are given, in order."""
-        if names is None:
-            names = [each.name for each in fields(self)]
-        return [name for name in names if getattr(self, name) is not None]
 
-    def refuse(self, flag: str, others: Mapping[str, str]) -> None:
-        """Refuse options that do not go with ``flag``, each with its reason."""
-        for name, why in others.items():
-            if getattr(self, name):
-                raise InputError(f"{flag}: does not go with {flag_of(name)}{why}")
+@dataclass(frozen=True, kw_only=True)
+class ConventionOptions:
+    """What numbers of the files mean: the error, the order of a covariance, axes of world and body."""
+
+    error: str | None = None
+    covariance_order: str | None = None
+    world: str | None = None
+    body_axes: str | None = None
+    truth_world: str | None = None
+    truth_body_axes: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComponentOptions:
+    """Components of the error, and names of their columns."""
+
+    state: Sequence[str] | None = None
+    axes: Sequence[str] | None = None
+    columns: Mapping[str, str] | None = None
+    truth_columns: Mapping[str, str] | None = None
+    members: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingOptions:
+    """How estimates are compared with the truth: clocks, frames, the point that is measured."""
+
+    max_dt: float | None = None
+    time_offset: float | str | None = None
+    align: str | None = None
+    lever_arm: Sequence[float] | None = None
 
     @property
     def tolerance(self) -> float:
@@ -193,7 +131,201 @@ class Reading:
         return self.time_offset if isinstance(self.time_offset, float) else 0.0
 
 
-OPTIONS = [each for each in fields(Reading) if each.metadata]  # those that users give
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What is judged as a run: a log, its pieces or windows, a row."""
+
+    relative: str | float | None = None
+    motions: bool | None = None
+    windows: str | None = None
+    independent: bool | None = None
+    split: str | int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruthOptions:
+    """What is declared of errors of the truth itself."""
+
+    truth_covariance: str | None = None
+    truth_errors: str | None = None
+    truth_shared: bool | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatementOptions:
+    """What estimates state in place of covariances, or in addition to them."""
+
+    level: str | float | Mapping[str, Any] | None = None
+    gaussian: bool | None = None
+    ends: str | None = None
+    dof: int | None = None
+    ensemble: int | None = None
+    unstated: bool | None = None  # of no command line: the covariance is I where the files state none
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupOptions:
+    """The column that makes groups."""
+
+    by: str | None = None
+    by_file: Path | None = None
+    bins: int | Sequence[float] | None = None
+
+    @property
+    def own_column(self) -> str | None:
+        """The column if it stands beside the estimates; None if it is of another file, or none is asked for."""
+        return self.by if self.by_file is None else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """Options of files; None leaves one to the kind of file. :func:`consistency.read` describes them.
+
+    :func:`make_reading` makes one of the options by name.
+    """
+
+    sources: SourceOptions = SourceOptions()
+    conventions: ConventionOptions = ConventionOptions()
+    components: ComponentOptions = ComponentOptions()
+    matching: MatchingOptions = MatchingOptions()
+    runs: RunOptions = RunOptions()
+    truth: TruthOptions = TruthOptions()
+    statement: StatementOptions = StatementOptions()
+    groups: GroupOptions = GroupOptions()
+
+    def option(self, name: str) -> Any:
+        """The value of an option, by its name."""
+        return getattr(getattr(self, VALUES[name]), name)
+
+    def given(self, names: Iterable[str] | None = None) -> list[str]:
+        """Options among ``names``, or among all, that are given, in order."""
+        return [name for name in (NAMES if names is None else names) if self.option(name) is not None]
+
+    def as_options(self) -> dict[str, Any]:
+        """Values of the options that are given, by name."""
+        return {name: self.option(name) for name in self.given()}
+
+    def refuse(self, flag: str, others: Mapping[str, str]) -> None:
+        """Refuse options that do not go with ``flag``, each with its reason."""
+        for name, why in others.items():
+            if self.option(name):
+                raise InputError(f"{flag}: does not go with {flag_of(name)}{why}")
+
+    def with_options(self, **options: Any) -> Reading:
+        """Other values of some options, by name.
+
+        Raises
+        ------
+        TypeError
+            There is no such option.
+        """
+        changed: dict[str, dict[str, Any]] = {}
+        for name, value in options.items():
+            if name not in VALUES:
+                raise TypeError(f"no option of files: {name}")
+            changed.setdefault(VALUES[name], {})[name] = value
+        return replace(self, **{part: replace(getattr(self, part), **own) for part, own in changed.items()})
+
+    def with_truth(self, truth: Path | None) -> Reading:
+        """The options with another file of the truth."""
+        return replace(self, sources=replace(self.sources, truth=truth))
+
+    def with_error(self, error: str | None) -> Reading:
+        """The options with another convention of the error."""
+        return replace(self, conventions=replace(self.conventions, error=error))
+
+
+def make_reading(**options: Any) -> Reading:
+    """Options of files by name; raises TypeError where there is no such option."""
+    return Reading().with_options(**options)
+
+
+@dataclass(frozen=True)
+class Option:
+    """How the command line shows an option, and what it makes of a text."""
+
+    name: str
+    help: str
+    metavar: str | None = None
+    parse: Callable[[str], Any] | None = None
+    flag: str | None = None
+    values: Sequence[str] = ()
+
+
+OPTIONS = (  # those that users give, in the order in which the command line shows them
+    Option("truth", "Truth like the estimates, KITTI drive, or 'repeats'."),
+    Option("covariance", "Covariances of a TUM trajectory: t, 36 or 21 numbers."),
+    Option(
+        "error",
+        "Error definition the covariance refers to: so2, vector, left, right, so3, so3-body, rvec, euler, additive, or "
+        "guess.",
+        "ERROR",
+        values=ERRORS,
+    ),
+    Option("state", "Columns of the state [x,y,heading].", "A,B,C", _names),
+    Option(
+        "covariance_order",
+        "Order of the covariance: translation-rotation [default], rotation-translation, or blocks of p, R, v, bg, ba "
+        "such as p,v,R.",
+    ),
+    Option("max_dt", f"Maximum time between an estimate and its truth, s [{MAX_DT:g}]."),
+    Option("time_offset", "Seconds to add to the timestamps of the estimates.", "S|estimate", _seconds),
+    Option("axes", "Components of a trajectory to judge: x,y,yaw.", "A,B,C", _names),
+    Option("topic", "Topic of the estimates in a ROS bag."),
+    Option("truth_topic", "Topic of the truth in a ROS bag, or PARENT:CHILD, two frames of /tf."),
+    Option("body", "Body that a KITTI drive as truth refers to: imu [default], velodyne or camera."),
+    Option("relative", "Judge motions over windows: steps, seconds, metres.", "N|Ns|Nm", str),
+    Option("motions", "Read each row as a motion with its own covariance (with --relative).", flag="--motions/"),
+    Option("windows", "'independent': treat each window as an independent run."),
+    Option("independent", "Each row, or window, is an independent run.", flag="--independent/"),
+    Option(
+        "align",
+        "Move estimates into the world of the truth: none; origin, by the first pose of each run; posyaw or se3, by "
+        "a frame fitted to each run (posyaw-all, se3-all: to all).",
+        "MODE",
+        values=MODES,
+    ),
+    Option("lever_arm", "Point that a truth of positions measures, in the axes of the body, m.", "X,Y,Z", _lengths),
+    Option("split", "Split one log into N runs, taken as independent.", "auto|N", str),
+    Option(
+        "truth_covariance",
+        "Covariance of the truth: 'columns' of its file, or a file of t and 36 or 21 numbers.",
+        "columns|FILE",
+    ),
+    Option("truth_errors", "Dependence of the truth's errors: independent, per-run, or common to all runs."),
+    Option("truth_shared", "Declare that the estimator has fused the truth.", flag="--truth-shared/"),
+    Option("level", "Level of bounds and radii: 95%, 2sigma, CEP.", "LEVEL", str),
+    Option(
+        "gaussian",
+        "Read them (or deviations) at that --level as the covariance of a Gaussian, circular for radii.",
+        flag="--gaussian/",
+    ),
+    Option("ends", "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."),
+    Option("by", "Judge groups by this column, too: bins, or words.", "COLUMN"),
+    Option("by_file", "Table with that column and t, run or both."),
+    Option("bins", "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins),
+    Option(
+        "columns",
+        "What columns of the estimates are called: x=pos_n,y=pos_e; P*=cov_* for all that begin alike.",
+        "NAME=COLUMN,…",
+        _columns,
+    ),
+    Option("truth_columns", "What columns of the truth are called, as --columns.", "NAME=COLUMN,…", _columns),
+    Option("world", "World axes of the estimates: enu [default], ned ...", "AXES"),
+    Option("body_axes", "Axes of the body of the estimates: flu [default], frd ...", "AXES"),
+    Option("truth_world", "Axes of the world of the truth [enu].", "AXES"),
+    Option("truth_body_axes", "Axes of the body of the truth [flu].", "AXES"),
+    Option("dof", "Degrees of freedom of each NIS of a table that has no column of them.", "N"),
+    Option(
+        "members",
+        "Columns of the members of an ensemble: x=e* for all that begin with e.",
+        "NAME=COLUMN*,…",
+        _columns_of_members,
+    ),
+    Option("ensemble", "Number of members whose mean and sample covariance the files state.", "N"),
+)
+VALUES = {each.name: part.name for part in fields(Reading) for each in fields(getattr(Reading, part.name))}  # by option
+NAMES = tuple(dict.fromkeys([*(each.name for each in OPTIONS), *VALUES]))
 
 
 def flag_of(name: str) -> str:

@@ -31,8 +31,8 @@ def require_truth_options(r: Reading) -> None:
     InputError
         Names the option, and the reason.
     """
-    if r.truth_errors not in (None, *DECLARED):
-        raise InputError(f"--truth-errors {r.truth_errors}: must be {', '.join(DECLARED[:-1])} or {DECLARED[-1]}")
+    if r.truth.truth_errors not in (None, *DECLARED):
+        raise InputError(f"--truth-errors {r.truth.truth_errors}: must be {', '.join(DECLARED[:-1])} or {DECLARED[-1]}")
     if asked := r.given(["truth_covariance", "truth_errors", "truth_shared"]):
         r.refuse(flag_of(asked[0]), REFUSED)
 
@@ -67,7 +67,7 @@ def declared(records: Sequence[Record], r: Reading) -> list[Record]:
                 f"{record.name}: the covariance of the truth in run {record.run_numbers[run]}, step {step + 1} is not "
                 "a covariance: it is not symmetric, or negative in some direction"
             )
-        record = replace(record, truth=Truth(P, r.truth_errors, bool(r.truth_shared)))
+        record = replace(record, truth=Truth(P, r.truth.truth_errors, bool(r.truth.truth_shared)))
         missing = 0
         if record.errors.nees is not None:
             unknown = np.isnan(P).any(axis=(2, 3))

@@ -9,7 +9,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import chain, takewhile
 from pathlib import Path
@@ -26,7 +26,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import file_kinds, flight_logs
 from consistency.referee.readers.formats.columns import CLOCKS, OWN, TRUE, covariance_columns, state_columns, stem_of
 from consistency.referee.readers.formats.innovation_files import SeveralError
-from consistency.referee.readers.options import OPTIONS, Reading, flag_of
+from consistency.referee.readers.options import OPTIONS, Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline import read_files
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import WHOLE, Estimator, submatrices
@@ -154,7 +154,7 @@ def inspect(path: Path, r: Reading | None = None) -> Inspection:
         extra = ("--innovations", "optimal")
         why.append(("--innovations", OPTIMAL))
     command = _command("analyse", path, tried.reading, extra)
-    arguments = {name: getattr(tried.reading, name) for name in tried.reading.given()}
+    arguments = tried.reading.as_options()
     notes += _groups(path, tried)
     return Inspection(path, kind.name, facts, tuple(notes), tuple(why), command, arguments=arguments)
 
@@ -185,7 +185,7 @@ def _search(path: Path, r: Reading, why: Mapping[str, str], depth: int) -> Attem
     if not (furthest.refusal or furthest.is_without_truth) or not depth:
         return furthest
     for name, value, reason in _proposals(path, r):
-        tried = _search(path, replace(r, **{name: value}), {**why, name: reason}, depth - 1)
+        tried = _search(path, r.with_options(**{name: value}), {**why, name: reason}, depth - 1)
         if not tried.refusal:
             return tried
         is_of_option = flag_of(name) in tried.refusal or str(value) in tried.refusal
@@ -199,13 +199,13 @@ def _proposals(path: Path, r: Reading) -> Iterator[tuple[str, Any, str]]:
     if file_kinds.is_bag(path):
         yield from _topics(path, r)
         return
-    if r.truth is None and not TRUTH.search(path.stem):
+    if r.sources.truth is None and not TRUTH.search(path.stem):
         for other in _beside(path, TRUTH):
             yield "truth", other, "called a truth, beside the estimates"
-    if r.covariance is None and path.suffix != ".csv" and not (path.is_dir() and file_kinds.table_files(path)):
+    if r.sources.covariance is None and path.suffix != ".csv" and not (path.is_dir() and file_kinds.table_files(path)):
         for other in _beside(path, COVARIANCE):
             yield "covariance", other, "called a covariance, beside the estimates"
-    if r.state is None and (state := _state(path, r)):
+    if r.components.state is None and (state := _state(path, r)):
         yield "state", state, "columns of numbers with a truth and a stated covariance"
 
 
@@ -214,16 +214,16 @@ def _topics(path: Path, r: Reading) -> Iterator[tuple[str, Any, str]]:
     from consistency.referee.readers.formats.ros_bag import ESTIMATES, FIX, POSES, topics_of
 
     topics = sorted(topics_of(path), key=lambda one: -one.messages)
-    if r.topic is None:
+    if r.sources.topic is None:
         there = [one for one in topics if one.kind in ESTIMATES and not TRUTH.search(one.name)]
         there.sort(key=lambda one: (one.kind in FIX, not FILTERED.search(one.name)))
         for one in there[:MOST]:
             others = ", ".join(other.name for other in there if other is not one)
             reason = "has poses with covariances, and is not called a truth"
             yield "topic", one.name, reason + (f"; {others} would do, too" if others else "")
-    elif r.truth_topic is None:
+    elif r.sources.truth_topic is None:
         for one in topics:
-            if one.kind in POSES and one.name != r.topic and TRUTH.search(one.name):
+            if one.kind in POSES and one.name != r.sources.topic and TRUTH.search(one.name):
                 yield "truth_topic", one.name, "has poses, and is called a truth"
 
 
@@ -245,8 +245,8 @@ def _state(path: Path, r: Reading) -> list[str]:
     """Columns of a table that have a truth, beside it or in its file, and a covariance; none where a pose is there."""
     names = _names(path, r)
     true = {stem_of(name, TRUE) for name in names}
-    if r.truth is not None and not r.truth.is_dir():
-        true |= {*_names(r.truth, Reading(columns=r.truth_columns))}
+    if r.sources.truth is not None and not r.sources.truth.is_dir():
+        true |= {*_names(r.sources.truth, make_reading(columns=r.components.truth_columns))}
     state = [name for name in names if name in true and name.lower() not in COUNTED]
     stated = [axis for axis in state if covariance_columns(names, [axis]).in_order(1)]
     if len(state_columns(names, POSE, OWN)) == len(POSE) or not stated:
@@ -261,8 +261,8 @@ def _names(path: Path, r: Reading) -> list[str]:
     if path.suffix.lower() in file_kinds.TABLES[1:]:
         from consistency.referee.readers.formats.sheet import read_sheet
 
-        return list(read_sheet(path, r.columns).data)
-    head = None if file_kinds.is_solution(path) else file_kinds.head_of(path, r.columns)
+        return list(read_sheet(path, r.components.columns).data)
+    head = None if file_kinds.is_solution(path) else file_kinds.head_of(path, r.components.columns)
     return [] if head is None else list(head.names)
 
 
@@ -273,11 +273,11 @@ def _advised(path: Path, tried: Attempt) -> Attempt:
         advised = ADVICE.search(note)
         if advised is None or note.count("--") > 1 or "or if" in note or advised[1] not in options:
             continue
-        name, parse = options[advised[1]].name, options[advised[1]].metadata["parse"]
+        name, parse = options[advised[1]].name, options[advised[1]].parse
         value: Any = advised[2] if parse is None else parse(advised[2])
         why = {**tried.why, name: note.partition(": ")[2].partition("; ")[0]}
-        if getattr(tried.reading, name) is None:
-            again = _attempt(path, replace(tried.reading, **{name: value}), why)
+        if tried.reading.option(name) is None:
+            again = _attempt(path, tried.reading.with_options(**{name: value}), why)
             if not again.refusal and all(note not in record.origin.notes for record in again.records):
                 tried = again
     return tried
@@ -292,8 +292,8 @@ def _groups(path: Path, tried: Attempt) -> list[str]:
         path = path if file_kinds.is_one_bag(path) else min(filter(file_kinds.is_one_bag, path.iterdir()))
     elif file_kinds.is_solution(path):
         names = ["Q", "ns"]
-    for name in names[:MOST] if tried.reading.by is None else ():
-        if not _attempt(path, replace(tried.reading, by=name), {}).refusal:
+    for name in names[:MOST] if tried.reading.groups.by is None else ():
+        if not _attempt(path, tried.reading.with_options(by=name), {}).refusal:
             others = listed([other for other in names if other != name])
             return [f"--by {name} says where the covariance is wrong" + (f"; also {others}" if others else "")]
     return []
@@ -309,7 +309,7 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
         with suppress(InputError):
             return _innovations(path, r, kind.name, facts)
     why = [(flag_of(name), text) for name, text in tried.why.items()]
-    if not tried.found and (r.truth or r.truth_topic) and set(r.given()) <= OF_DRIVES:
+    if not tried.found and (r.sources.truth or r.sources.truth_topic) and set(r.given()) <= OF_DRIVES:
         with suppress(InputError):
             found = kind.read(path, read_files.checked_options(r), True)
             why.append(("--span", "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"))
@@ -317,8 +317,8 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
             command = _command("fit-covariance", path, r, ("--span", "1m"))
             return Inspection(path, kind.name, (*facts, *Attempt(r, {}, found).facts), (note,), tuple(why), command)
     notes = ("by its name it is the truth; inspect the estimates",) if TRUTH.search(path.stem) else ()
-    if not tried.found and r.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts
-        own = _attempt(path, replace(r, truth=path), {}).facts
+    if not tried.found and r.sources.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts
+        own = _attempt(path, r.with_truth(path), {}).facts
         facts = (*facts, *(fact for fact in own if fact[0] != "truth"))
     return Inspection(path, kind.name, facts, notes, tuple(why), missing=tried.refusal)
 
@@ -326,12 +326,13 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
 def _innovations(path: Path, r: Reading, kind: str, facts: Pairs = (), choice: Mapping[str, Any] = {}) -> Inspection:
     """Innovations of one run, which the monitor judges; ``choice`` of a filter and a run."""
     try:
-        log = read_innovations(path, choice.get("filter"), choice.get("run"), replace(r, truth=None))
+        log = read_innovations(path, choice.get("filter"), choice.get("run"), r.with_truth(None))
     except SeveralError as several:
         there = (f"{several.what}s", listed(several.there, 30))
         return _innovations(path, r, kind, (*facts, there), {several.option: several.there[0], **choice})
     extra = [word for name, value in choice.items() for word in (f"--{name}", str(value))]
-    command = _command("monitor", path, Reading(columns=r.columns, dof=r.dof), (*extra, "--innovations", "optimal"))
+    own = make_reading(columns=r.components.columns, dof=r.statement.dof)
+    command = _command("monitor", path, own, (*extra, "--innovations", "optimal"))
     judged = log.dof > 0
     dof = listed(np.unique(log.dof[judged]).astype(int).tolist())
     facts = (*facts, ("innovations", f"{judged.sum()}{_span(log.t)}, degrees of freedom {dof}"))
@@ -451,8 +452,7 @@ def _suspects(e: Estimator) -> Iterator[str]:
 def _command(name: str, path: Path, r: Reading, extra: Sequence[str] = ()) -> str:
     """A command line that a shell runs as it stands."""
     words = ["consistency", name, str(path)]
-    for option in r.given():
-        value = getattr(r, option)
+    for option, value in r.as_options().items():
         if isinstance(value, Mapping):
             value = ",".join(f"{new}={old}" for new, old in value.items())
         elif isinstance(value, (list, tuple)):

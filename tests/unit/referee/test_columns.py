@@ -26,7 +26,7 @@ from consistency.referee.readers.formats.columns import (
 from consistency.referee.readers.formats.restated import text_files
 from consistency.referee.readers.formats.sheet import read_sheet
 from consistency.referee.readers.formats.table_columns import with_clock
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, make_reading
 
 HERE = Path("a.csv")
 POSE = ("x", "y", "heading")
@@ -275,7 +275,7 @@ def restated(names, r):
 
 
 def test_where_the_covariances_of_a_file_stand(inside):
-    state = Reading(state=("a", "b"))
+    state = make_reading(state=("a", "b"))
     both = ["t", "a", "b", "P11", "P12", "P21", "P22"]
     assert restated(both, state) == (
         {"P11": ("a", "a"), "P12": ("a", "b"), "P21": ("b", "a"), "P22": ("b", "b")}, True
@@ -286,7 +286,7 @@ def test_where_the_covariances_of_a_file_stand(inside):
     variances = [*SPACE, *(f"var_{word}" for word in words)]
     assert restated(variances, Reading()) == ({f"var_{word}": (word, word) for word in words}, True)
     deviations = [*SPACE, *(f"sd_{word}" for word in words)]
-    turned = Reading(covariance_order="rotation-translation")
+    turned = make_reading(covariance_order="rotation-translation")
     assert restated(deviations, turned) == (
         {f"sd_{word}": (axis, axis) for word, axis in zip(words, [*words[3:], *words[:3]], strict=True)}, False
     )  # fmt: skip

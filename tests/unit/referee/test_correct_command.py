@@ -377,10 +377,10 @@ def test_factors_by_what_selects_on_the_outcome_are_refused(tables, tmp_path, ca
 
 def test_standard_deviations_come_back_as_such(tmp_path, rng):
     from consistency.referee.readers.formats.restated import text_files
-    from consistency.referee.readers.options import Reading
+    from consistency.referee.readers.options import make_reading
 
     (tmp_path / "s.csv").write_text('t;a;b;sigma_a;sigma_b;"note"\n0;1;2;3;4;"x; y"\n1;1;2;;4;z\n')
-    (file,) = text_files(tmp_path / "s.csv", Reading(state=("a", "b")))
+    (file,) = text_files(tmp_path / "s.csv", make_reading(state=("a", "b")))
     text = file.restated(lambda run, value: {"a": (4.0, 13.0)})
     assert text.splitlines()[1].split(";")[3:5] == ["7.0", "4.0"]
     assert text.splitlines()[2].split(";")[3:5] == ["", "4.0"]

@@ -31,7 +31,7 @@ from consistency.referee.fit_covariance.fit_files import (
     write_model,
 )
 from consistency.referee.geometry import composed, vectors
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 
 SPAN = "10m"
 
@@ -293,7 +293,7 @@ def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path):
     drive = drives(np.random.default_rng(5), 1, length=100.0)[0]
     estimates, _ = write_tables([replace(drive, t=drive.t - 0.2)], tmp_path / "late")
     true = write_tables([drive], tmp_path)[1]
-    (shifted,) = cs.read_drives(estimates, reading=Reading(truth=true, time_offset=0.2))
+    (shifted,) = cs.read_drives(estimates, reading=make_reading(truth=true, time_offset=0.2))
     assert_allclose(shifted.t, drive.t)
     assert_allclose(shifted.truth, drive.truth, atol=1e-9)
     steps = np.linalg.inv(drive.estimate[:-1]) @ drive.estimate[1:]
@@ -302,7 +302,7 @@ def test_offset_of_clocks_motions_and_folders_of_speeds(tmp_path):
     motions.write_text("t,x,y,heading\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
     one = tmp_path / "one.csv"
     one.write_text(true.read_text().replace("run,", "").replace("\n1,", "\n"))
-    (found,) = cs.read_drives(motions, reading=Reading(truth=one, motions=True))
+    (found,) = cs.read_drives(motions, reading=make_reading(truth=one, motions=True))
     assert_allclose(found.estimate, drive.estimate, atol=1e-9)
     for name in ("wheels", "truth"):
         (tmp_path / "drives" / name).mkdir(parents=True)

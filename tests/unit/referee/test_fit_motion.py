@@ -26,7 +26,7 @@ from consistency.referee.fit_covariance.refusals import TERMS, mean_by_motion, p
 from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.geometry import composed, inverse, vectors
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import Poses, unstated
 
@@ -307,10 +307,10 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path, rng):
         for name, t, rows in (("est", poses.t, poses.estimate), ("truth", poses.true_t, poses.truth)):
             table = np.column_stack([t, rows])
             np.savetxt(tmp_path / name / f"{i}.csv", table, delimiter=",", header="t,x,y,heading", comments="")
-    given = Reading(truth=tmp_path / "truth", time_offset="estimate", max_dt=0.5)
+    given = make_reading(truth=tmp_path / "truth", time_offset="estimate", max_dt=0.5)
     found = cs.read_drives(tmp_path / "est", reading=given)
     assert found[0].shift == pytest.approx(0.2, abs=0.02)
-    fixed = cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=found[0].shift))
+    fixed = cs.read_drives(tmp_path / "est", reading=given.with_options(time_offset=found[0].shift))
     assert_array_equal(found[2].t, fixed[2].t)
     assert_array_equal(found[2].truth, fixed[2].truth)
     assert fixed[0].shift == 0.0
@@ -318,8 +318,8 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path, rng):
     assert f"clocks: {found[0].shift:.3g} s are added to the timestamps" in "\n".join(noise_lines(model))
     assert "clocks" not in "\n".join(noise_lines(replace(model, windows=replace(model.windows, drives=tuple(fixed)))))
     with pytest.raises(InputError, match="--time-offset fast: must be a number of seconds, or 'estimate'"):
-        cs.read_drives(tmp_path / "est", reading=replace(given, time_offset="fast"))
-    whole = [cs.read_drives(tmp_path / "est", reading=replace(given, time_offset=one))[0].t[0] for one in (1, 1.0)]
+        cs.read_drives(tmp_path / "est", reading=given.with_options(time_offset="fast"))
+    whole = [cs.read_drives(tmp_path / "est", reading=given.with_options(time_offset=one))[0].t[0] for one in (1, 1.0)]
     assert whole[0] == whole[1]
 
 

@@ -5,7 +5,7 @@ import pytest
 from command import consistency, refused
 
 import consistency as cs
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 
 N = 120
@@ -116,7 +116,7 @@ def test_innovations_of_rows_are_runs(tmp_path, capsys):
     nis = np.random.default_rng(7).chisquare(2, 60)
     rows = "\n".join(f"{k + 1},{v!r},2" for k, v in enumerate(nis.tolist()))
     (tmp_path / "nis.csv").write_text(f"step,nis,nis_dof\n{rows}\n")
-    (record,) = read_recordings(tmp_path / "nis.csv", Reading(independent=True))
+    (record,) = read_recordings(tmp_path / "nis.csv", make_reading(independent=True))
     assert (record.innovations.nis.shape, record.innovations.nis_dof.shape, record.runs.unit) == (
         (60, 1),
         (60, 1),

@@ -19,7 +19,7 @@ from test_fixes import PLACE, STEPS, solution
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.verdicts.inspect_sources import _command
 
 RUNS, ROWS = 6, 40
@@ -372,7 +372,7 @@ def test_a_refusal_names_an_inspection_that_would_say_more(tmp_path, capsys):
 
 
 def test_a_command_line_has_every_kind_of_option():
-    reading = Reading(axes=["x", "y"], relative="2", motions=True, columns={"x": "px", "y": "py"})
+    reading = make_reading(axes=["x", "y"], relative="2", motions=True, columns={"x": "px", "y": "py"})
     assert shlex.split(_command("analyse", Path("my est"), reading, ("--bins", "3"))) == [
         "consistency", "analyse", "my est", "--axes", "x,y", "--relative", "2", "--motions", "--columns", "x=px,y=py",
         "--bins", "3",

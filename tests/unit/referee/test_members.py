@@ -17,7 +17,7 @@ from consistency.referee.diagnostics.statistics.normal_numbers import (
     step_down_tables,
 )
 from consistency.referee.pages.record_figures import rank_shares, record_figures
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 
 RARE = 1e-5
@@ -323,7 +323,7 @@ def test_files_of_members_are_judged_as_arrays_are(tmp_path):
     assert cs.judge(record).p_value == pytest.approx(verdict.p_value)
     e, P = mean_and_covariance(truth, members)
     np.savez(tmp_path / "e.npz", errors=e, covariances=P)
-    (ensemble,) = read_recordings(tmp_path / "e.npz", Reading(ensemble=6))
+    (ensemble,) = read_recordings(tmp_path / "e.npz", make_reading(ensemble=6))
     assert cs.judge(ensemble).p_value == cs.judge(e, P, ensemble=6).p_value
 
 

@@ -1,6 +1,7 @@
 """Options of files: one record for readers, commands and Python; tables in memory are read as files of them are."""
 
 import inspect
+from dataclasses import fields
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from records import changed
 import consistency as cs
 from consistency.diagnostics import make_record
 from consistency.referee.notebook import read_and_judge
-from consistency.referee.readers.options import MAX_DT, OPTIONS, Reading, flag_of
+from consistency.referee.readers.options import MAX_DT, OPTIONS, Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline.read_files import own_names
 from consistency.testing import assert_consistent
 
@@ -30,16 +31,38 @@ def test_each_option_of_python_reaches_the_readers_under_its_name(monkeypatch):
     monkeypatch.setattr(read_and_judge, "read_recordings", lambda path, reading: [seen.append(reading)])
     with pytest.raises(AttributeError):  # of a record that is None
         cs.read("est.csv", **given)
-    assert {name: str(getattr(seen[0], name)) for name in given} == given
-    with pytest.raises(TypeError, match="positional"):
-        Reading("truth.csv")
+    assert {name: str(value) for name, value in seen[0].as_options().items()} == given
+    assert seen[0] == make_reading(**{name: seen[0].option(name) for name in given})
+
+
+def test_each_option_is_a_field_of_one_value():
+    """Every value of a reading has few fields, and no option stands in two of them."""
+    values = [getattr(Reading(), part.name) for part in fields(Reading)]
+    names = [each.name for value in values for each in fields(value)]
+    assert len(set(names)) == len(names)
+    assert set(names) == {each.name for each in OPTIONS} | {"unstated"}
+    assert max(len(fields(value)) for value in (Reading(), *values)) <= 12
+    for name in names:
+        changed = make_reading(**{name: "given"})
+        assert changed.given() == [name]
+        assert changed.as_options() == {name: "given"}
+        assert changed.option(name) == "given"
+        others = [part for value, part in zip(values, fields(Reading), strict=True) if not hasattr(value, name)]
+        assert all(getattr(changed, part.name) == getattr(Reading(), part.name) for part in others)
+        assert changed.with_options(**{name: None}) == Reading()
+    with pytest.raises(TypeError, match="thruth"):
+        make_reading(thruth="truth.csv")
 
 
 def test_what_follows_from_options():
-    assert (Reading().tolerance, Reading().shift) == (MAX_DT, 0.0)
-    given = Reading(max_dt=0.5, time_offset=-2.0, motions=False)
-    assert (given.tolerance, given.shift) == (0.5, -2.0)
-    assert Reading(time_offset="estimate").shift == 0.0
+    assert (Reading().matching.tolerance, Reading().matching.shift) == (MAX_DT, 0.0)
+    given = make_reading(max_dt=0.5, time_offset=-2.0, motions=False)
+    assert (given.matching.tolerance, given.matching.shift) == (0.5, -2.0)
+    assert make_reading(time_offset="estimate").matching.shift == 0.0
+    assert given.with_truth("a.csv").with_error("left").given() == [
+        "truth", "error", "max_dt", "time_offset", "motions"
+    ]  # fmt: skip
+    assert (make_reading(by="q").groups.own_column, make_reading(by="q", by_file="f").groups.own_column) == ("q", None)
     assert given.given() == ["max_dt", "time_offset", "motions"]
     assert given.given(["axes", "time_offset"]) == ["time_offset"]
     assert flag_of("max_dt") == "--max-dt"
@@ -163,7 +186,7 @@ def test_columns_are_called_as_their_user_does(tmp_path):
 )
 def test_components_have_names_of_columns_whose_error_is_theirs(of_record, columns, align, names):
     record = changed(make_record("f", axes=("x", "y", "vx"), convention="so3"), **of_record)
-    own = own_names(record, Reading(columns=columns, align=align))
+    own = own_names(record, make_reading(columns=columns, align=align))
     assert changed(record, own_names=own).errors.names == names
 
 

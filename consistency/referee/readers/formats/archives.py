@@ -28,7 +28,7 @@ from consistency.referee.readers.formats.pose_rows import are_rotations, quatern
 from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof, checked_dof
 from consistency.referee.readers.formats.text_blocks import bounded
 from consistency.referee.readers.mix_ups.hints import turns
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import GroupOptions, Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import Bounds, Estimator, Poses, at, manifold_of, unstated
@@ -89,10 +89,10 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     if not set(arrays) >= OF_STATES:
         return [estimator_of_arrays(path, arrays, r)]
 
-    errors, definition = extended_errors(path, arrays, r.error)
-    one = estimator_of_arrays(path, errors, replace(r, error=None))
+    errors, definition = extended_errors(path, arrays, r.conventions.error)
+    one = estimator_of_arrays(path, errors, r.with_error(None))
     assert isinstance(one, Estimator)
-    return [replace(one, convention=r.error or "", definition=definition)]
+    return [replace(one, convention=r.conventions.error or "", definition=definition)]
 
 
 def first_known(repeats: Array) -> Array:
@@ -111,18 +111,18 @@ def steps_of(of: Path | str, run: int, rows: Indices) -> Places:
 def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> Estimator | Record:
     """The estimator of arrays by key, or its record where they are NEES; ``path`` names it in messages."""
     states = arrays.get("errors", arrays.get("estimates"))
-    if r.unstated and "covariances" not in arrays and states is not None:
+    if r.statement.unstated and "covariances" not in arrays and states is not None:
         arrays = {**arrays, "covariances": np.zeros((*states.shape, *states.shape[-1:]))}
     archive = Archive(path, arrays)
     bounds = sizes = None
-    if "bounds" in archive or r.level is not None:
+    if "bounds" in archive or r.statement.level is not None:
         archive, bounds, sizes = _with_bounds(archive, r)
         arrays = archive.arrays
     kind = _kind(archive, r)
     if kind == OF_NEES:
-        found = _of_nees(archive, bool(r.independent))
+        found = _of_nees(archive, bool(r.runs.independent))
         assert found.errors.nees is not None
-        return replace(found, runs=replace(found.runs, by=archive.groups(r, found.errors.nees.shape)))
+        return replace(found, runs=replace(found.runs, by=archive.groups(r.groups, found.errors.nees.shape)))
     declared = ""
     if kind == OF_MEMBERS:
         return _of_members(archive, r)
@@ -140,7 +140,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         declared = _convention(archive, r, estimates.shape[-1])
     runs, steps, n = estimates.shape
     shape = (runs, steps, n, n)
-    by = archive.groups(r, (runs, steps))
+    by = archive.groups(r.groups, (runs, steps))
     covariances = archive.matrices("covariances", shape)
     there = archive.known(runs, steps)
     if kind in (OF_POSES, OF_REPEATS):
@@ -149,7 +149,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     of_truth = cross = None
     if "truth_covariances" in archive:
         of_truth = archive.matrices("truth_covariances", shape)
-    if "cross_covariances" in archive and r.relative is not None and not r.motions:
+    if "cross_covariances" in archive and r.runs.relative is not None and not r.runs.motions:
         cross = archive.matrices("cross_covariances", shape)
     convention = declared or "vector"
     poses = []
@@ -176,7 +176,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         if declared and n == 3:
             remedy = "add --error so2, if these are x, y, heading"
         causes += turns(path.stem, axes, gap, covariances, remedy)
-    if r.relative is not None:  # poses, or motions of them
+    if r.runs.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
     definition = PLANAR.get(declared, "")
     return Estimator(
@@ -191,9 +191,9 @@ def _with_bounds(archive: Archive, r: Reading) -> tuple[Archive, Bounds | None, 
     where = f"{archive.path}: "
     arrays = dict(archive.arrays)
     if "bounds" not in archive:
-        bounds.require_gaussian(str(archive.path), r)
+        bounds.require_gaussian(str(archive.path), r.statement)
         if "covariances" in archive:
-            arrays["covariances"] = archive.require_numbers("covariances") * bounds.covariance_factor(r)
+            arrays["covariances"] = archive.require_numbers("covariances") * bounds.covariance_factor(r.statement)
         return replace(archive, arrays=arrays), None, None
     key = next((key for key in ("errors", "estimates") if key in archive), None)
     if key is None or "covariances" in archive:
@@ -202,7 +202,7 @@ def _with_bounds(archive: Archive, r: Reading) -> tuple[Archive, Bounds | None, 
     sizes = archive.require_numbers("bounds").astype(float)
     if archive.arrays[key].ndim < 3:  # one run
         sizes = sizes[None]
-    stated, values = bounds.stated_in_arrays(where, sizes, archive.axes(shape[-1]), shape, r)
+    stated, values = bounds.stated_in_arrays(where, sizes, archive.axes(shape[-1]), shape, r.statement)
     flat = bounds.covariance_of(stated, values.reshape(-1, *values.shape[2:]), shape[-1])
     arrays["covariances"] = flat.reshape(*shape, shape[-1])
     return replace(archive, arrays=arrays), stated, values
@@ -218,18 +218,18 @@ def _kind(archive: Archive, r: Reading) -> tuple[str, ...]:
     """
     path = archive.path
     keys = set(archive.arrays)
-    kinds = (OF_ERRORS, OF_REPEATS if r.repeats else OF_POSES, OF_MEMBERS, OF_NEES)
+    kinds = (OF_ERRORS, OF_REPEATS if r.sources.repeats else OF_POSES, OF_MEMBERS, OF_NEES)
     kind = next((needed for needed in kinds if set(needed) <= keys), None)
     if "weights" in keys:
         raise InputError(f"{path}: key 'weights': {UNWEIGHTED}")
     if kind is None:
         raise InputError(f"{path}: needs {KINDS}; it holds {', '.join(sorted(keys)) or 'nothing'}")
     unknown = sorted(keys - set(kind) - OPTIONAL)
-    if unknown and r.by is None:
+    if unknown and r.groups.by is None:
         raise InputError(f"{path}: key '{unknown[0]}' does not go with {', '.join(kind)}; needs {KINDS}")
-    if r.error is not None and kind not in (OF_POSES, OF_REPEATS):
+    if r.conventions.error is not None and kind not in (OF_POSES, OF_REPEATS):
         raise InputError(f"--error: {path} holds {kind[0]}, whose convention is settled already")
-    if r.relative is not None and kind != OF_POSES:
+    if r.runs.relative is not None and kind != OF_POSES:
         raise InputError(f"{path}: --relative needs the keys {', '.join(OF_POSES)}, of poses or motions")
     return kind
 
@@ -251,7 +251,7 @@ def _of_members(archive: Archive, r: Reading) -> Estimator:
         return f"{path}: key 'members', run {k // steps}, step {k % steps + 1}"
 
     means = checked_members(members.reshape(-1, m, n), there.ravel(), place).mean(axis=1).reshape(truth.shape)
-    by = archive.groups(r, (runs, steps))
+    by = archive.groups(r.groups, (runs, steps))
     poses = []
     for one in _runs(archive, means, _finite_truth(path, means, truth, there), there):
         rows = one.run, slice(len(one.t))
@@ -261,10 +261,10 @@ def _of_members(archive: Archive, r: Reading) -> Estimator:
 
 def _convention(archive: Archive, r: Reading, n: int) -> str:
     """The error of estimates of n components; "vector" unless another is declared, "so2" of motions over windows."""
-    convention = r.error or ("vector" if r.relative is None else "so2")
-    if r.error is not None and (convention not in PLANAR or (convention != "vector" and n != 3)):
+    convention = r.conventions.error or ("vector" if r.runs.relative is None else "so2")
+    if r.conventions.error is not None and (convention not in PLANAR or (convention != "vector" and n != 3)):
         raise InputError(f"--error {convention}: here it is 'vector', or so2, left or right for x, y, heading")
-    if r.relative is not None and (n != 3 or convention == "vector"):
+    if r.runs.relative is not None and (n != 3 or convention == "vector"):
         raise InputError(f"{archive.path}: --relative needs poses x, y, heading, with --error so2, left or right")
     return convention
 
@@ -519,17 +519,18 @@ class Archive:
             raise InputError(f"{where} names {len(axes)} components, the error has {n}")
         return axes
 
-    def groups(self, r: Reading, shape: tuple[int, ...]) -> Array | None:
+    def groups(self, options: GroupOptions, shape: tuple[int, ...]) -> Array | None:
         """Cells of the key of ``--by``, (runs, steps); a value for each run stands in all of its steps."""
-        if r.by is None or r.by_file is not None:
+        by = options.own_column
+        if by is None:
             return None
-        if r.by not in self:
+        if by not in self:
             there = ", ".join(sorted(self.arrays))
-            raise InputError(f"--by {r.by}: {self.path} has no such key; it holds {there}")
+            raise InputError(f"--by {by}: {self.path} has no such key; it holds {there}")
         try:
-            return on_steps(self.arrays[r.by], shape)
+            return on_steps(self.arrays[by], shape)
         except ValueError as error:
-            raise InputError(f"{self.path}: key '{r.by}' {error}") from None
+            raise InputError(f"{self.path}: key '{by}' {error}") from None
 
 
 def _turned(found: tuple[int, ...], needed: tuple[int, ...]) -> str:

@@ -19,7 +19,7 @@ from consistency.referee.diagnostics.statistics.exceedance import deviations_of,
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, StatementOptions
 from consistency.referee.readers.places import refuse
 from consistency.referee.readers.truth_matching import Bounds, Estimator
 from consistency.referee.types import Array
@@ -98,16 +98,17 @@ class Levels:
 
 def require_bound_options(r: Reading) -> None:
     """Refuse options of bounds that say nothing, or do not go together."""
-    if r.ends not in (None, ENDS):
-        raise InputError(f"--ends {r.ends}: must be '{ENDS}'")
-    for flag, value in (("--gaussian", r.gaussian), ("--ends", r.ends)):
-        if value and r.level is None:
+    stated = r.statement
+    if stated.ends not in (None, ENDS):
+        raise InputError(f"--ends {stated.ends}: must be '{ENDS}'")
+    for flag, value in (("--gaussian", stated.gaussian), ("--ends", stated.ends)):
+        if value and stated.level is None:
             raise InputError(f"{flag}: goes with --level, as --level 95%")
-    if r.gaussian and r.ends:
+    if stated.gaussian and stated.ends:
         raise InputError("--ends: is for bounds; with --gaussian covariances are judged, so leave it out")
-    if r.level is not None:
-        Levels(r.level)
-    if r.level is not None and not r.gaussian:
+    if stated.level is not None:
+        Levels(stated.level)
+    if stated.level is not None and not stated.gaussian:
         others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
         r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
 
@@ -163,7 +164,7 @@ def with_centres(sheet: TableRows) -> TableRows:
     return replace(sheet, data=data)
 
 
-def stated_in(sheet: TableRows, axes: Sequence[str], r: Reading) -> tuple[Bounds, Array] | None:
+def stated_in(sheet: TableRows, axes: Sequence[str], options: StatementOptions) -> tuple[Bounds, Array] | None:
     """Bounds of a table, and for each row the distance to the lower and the upper end, (N, bounds, 2); or None.
 
     Raises
@@ -174,7 +175,7 @@ def stated_in(sheet: TableRows, axes: Sequence[str], r: Reading) -> tuple[Bounds
     found = bound_columns(list(sheet.data))
     if not found:
         return None
-    levels = Levels(r.level)
+    levels = Levels(options.level)
     levels.require([name for one in found for name in (one.name, *one.columns)])
     require_units([name for one in found for name in one.columns], sheet.path)
     values = np.empty((len(sheet), len(found), 2))
@@ -185,7 +186,7 @@ def stated_in(sheet: TableRows, axes: Sequence[str], r: Reading) -> tuple[Bounds
                                  f"{','.join(axes)}; --state names another")  # fmt: skip
         values[:, k] = _of_interval(sheet, one) if len(one.columns) == 2 else _of_bound(sheet, one)
     of = [levels.of(one.name, *one.columns) for one in found]
-    return _stated([(one.name, one.components) for one in found], of, axes, r), values
+    return _stated([(one.name, one.components) for one in found], of, axes, options), values
 
 
 def _of_bound(sheet: TableRows, one: BoundColumns) -> Array:
@@ -207,14 +208,14 @@ def _of_interval(sheet: TableRows, one: BoundColumns) -> Array:
 
 
 def _stated(
-    named: Sequence[tuple[str, tuple[str, ...]]], of: Sequence[Level], axes: Sequence[str], r: Reading
+    named: Sequence[tuple[str, tuple[str, ...]]], of: Sequence[Level], axes: Sequence[str], options: StatementOptions
 ) -> Bounds:
     bounds = []
     for (name, components), level in zip(named, of, strict=True):
-        bounds.append(Bound(name, components, level.of(len(components)), r.ends == ENDS))
+        bounds.append(Bound(name, components, level.of(len(components)), options.ends == ENDS))
     places = tuple(tuple(map(list(axes).index, components)) for _, components in named)
     deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, places, strict=True))
-    stated = Bounds(tuple(bounds), places, deviations, bool(r.gaussian))
+    stated = Bounds(tuple(bounds), places, deviations, bool(options.gaussian))
     twice = [axes[i] for i in set(sum(places, ())) if sum(places, ()).count(i) > 1]
     if stated.gaussian and twice:
         raise InputError(f"--gaussian: {twice[0]} has several bounds; leave all but one of them out")
@@ -225,7 +226,7 @@ def _stated(
 
 
 def stated_in_arrays(
-    where: str, bounds: Array, axes: Sequence[str], shape: tuple[int, ...], r: Reading
+    where: str, bounds: Array, axes: Sequence[str], shape: tuple[int, ...], options: StatementOptions
 ) -> tuple[Bounds, Array]:
     """Bounds (runs, steps, n) of each component, or (runs, steps) of the length of all; (runs, steps, bounds, 2).
 
@@ -234,7 +235,7 @@ def stated_in_arrays(
     InputError
         Another shape, or a negative bound.
     """
-    if r.level is None:
+    if options.level is None:
         raise InputError(f"{where}bounds need their level: --level 95%, or level=0.95 in Python")
     if bounds.shape == shape[:2]:
         named = [(_name("radius" if len(axes) > 1 else "bound", axes), tuple(axes))]
@@ -247,9 +248,9 @@ def stated_in_arrays(
     if (bounds < 0.0).any():
         run, step, _ = np.argwhere(bounds < 0.0)[0]
         raise InputError(f"{where}bounds, run {run}, step {step + 1}: negative; a bound is a size")
-    levels = Levels(r.level)
+    levels = Levels(options.level)
     levels.require([name for name, _ in named])
-    return _stated(named, [levels.of(name) for name, _ in named], axes, r), np.stack([bounds, bounds], axis=-1)
+    return _stated(named, [levels.of(name) for name, _ in named], axes, options), np.stack([bounds, bounds], axis=-1)
 
 
 def _name(kind: str, axes: Sequence[str]) -> str:
@@ -260,16 +261,16 @@ def _name(kind: str, axes: Sequence[str]) -> str:
     return "_".join([kind, *(unnamed or axes)])
 
 
-def require_gaussian(where: str, r: Reading) -> None:
+def require_gaussian(where: str, options: StatementOptions) -> None:
     """Refuse a level of covariances or deviations that is not declared to be that of a Gaussian."""
-    if not r.gaussian:
-        raise InputError(f"{where}: has no bounds at --level {r.level}: columns {COLUMNS}, or the key 'bounds' of an "
-                         "archive; with --gaussian it is the level of deviations")  # fmt: skip
+    if not options.gaussian:
+        raise InputError(f"{where}: has no bounds at --level {options.level}: columns {COLUMNS}, or the key 'bounds' "
+                         "of an archive; with --gaussian it is the level of deviations")  # fmt: skip
 
 
-def covariance_factor(r: Reading) -> float:
+def covariance_factor(options: StatementOptions) -> float:
     """Factor on covariances whose deviations are stated at a level."""
-    level = Levels(r.level).of("the covariance")
+    level = Levels(options.level).of("the covariance")
     return level.in_deviations(level.dimensions or 1) ** -2
 
 

@@ -114,13 +114,13 @@ def _files(folder: Path) -> list[Path]:
 
 def files_of_runs(estimates: Path, r: Reading, covariance: Path | None) -> list[tuple[Path, Path, Path | None]]:
     """Files of every run: estimates, truth (the estimates where it stands beside them), covariance."""
-    truth = r.truth
+    truth = r.sources.truth
     if not estimates.is_dir():
         for option, path in (("--truth", truth), ("--covariance", covariance)):
             if path is not None and path.is_dir() and not (option == "--truth" and is_drive(path)):
                 raise InputError(f"{option} {path}: is a folder, but {estimates} is one file")
         return [(estimates, truth or estimates, covariance)]
-    files = trajectory_files(estimates, r.columns)
+    files = trajectory_files(estimates, r.components.columns)
     if not files:
         raise InputError(f"{estimates}: holds no .txt or .tum file, no table and no manifest.json")
     twice, count = Counter(path.stem for path in files).most_common(1)[0]

@@ -110,7 +110,7 @@ def _require_columns(place: Path | str, columns: Sequence[str]) -> None:
 
 
 def _of_table(path: Path, filter_name: str | None, run: int | None, r: Reading) -> NisLog:
-    sheet, note = with_nis(read_sheet(path, r.columns), r.dof)
+    sheet, note = with_nis(read_sheet(path, r.components.columns), r.statement.dof)
     _require_columns(path, list(sheet.data))
     sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
     for key in ("step", "t"):
@@ -201,10 +201,10 @@ def stream_nis(lines: Iterable[str], name: str, r: Reading = DEFAULT) -> Iterato
         fields = table.row(number, text)
         if fields is None:
             empty = TableRows(table.path, dict.fromkeys(table.names, np.empty(0)), np.empty(0, int), "line")
-            _require_one_run(name, list(with_nis(empty.renamed(r.columns), r.dof)[0].data))
+            _require_one_run(name, list(with_nis(empty.renamed(r.components.columns), r.statement.dof)[0].data))
             continue
         row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
-        row, _ = with_nis(row.renamed(r.columns), r.dof)
+        row, _ = with_nis(row.renamed(r.components.columns), r.statement.dof)
         nis = float(row.numbers("nis")[0])
         dof = float(row.numbers("nis_dof")[0])
         if dof >= MOST_DOF:

@@ -389,7 +389,7 @@ def order_note(path: Path | str, n: int, r: Reading) -> str:
     InputError
         The declared order does not go with n components.
     """
-    order = r.covariance_order
+    order = r.conventions.covariance_order
     blocks = blocks_in(n, order or ORDERS[0])
     there = BLOCKS[: n // 3]
     if sorted(blocks) != sorted(there):
@@ -397,7 +397,7 @@ def order_note(path: Path | str, n: int, r: Reading) -> str:
         names = "(p position, R rotation, v velocity, bg, ba biases)"
         raise InputError(f"--covariance-order {order}: must be {' or '.join(ORDERS)}, or {which} {names}")
     if order is None:
-        head = None if n == 6 else head_of(Path(path), r.columns)
+        head = None if n == 6 else head_of(Path(path), r.components.columns)
         if n == 6 or (head is not None and not any(map(is_numbered, head.names))):
             return ""
     return f"{path}: the covariance is read in the order {', '.join(blocks)}; --covariance-order declares another one"

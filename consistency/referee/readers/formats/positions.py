@@ -64,13 +64,13 @@ def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
     alone = f"{poses[0].files[1]} holds positions alone"
     if any(one.manifold != "vector" for one in poses):
         raise InputError(f"{path}: the truth of some runs has orientations, of others none; judge them apart")
-    if r.relative is not None:
+    if r.runs.relative is not None:
         raise InputError(f"--relative: needs a truth with orientations; {alone}")
-    if r.align not in (None, "posyaw", "posyaw-all"):
-        raise InputError(f"--align {r.align}: needs a truth with orientations; {alone}")
-    for axis in r.axes or ():
+    if r.matching.align not in (None, "posyaw", "posyaw-all"):
+        raise InputError(f"--align {r.matching.align}: needs a truth with orientations; {alone}")
+    for axis in r.components.axes or ():
         if axis not in AXES[:3]:
-            raise InputError(f"--axes {','.join(r.axes or ())}: '{axis}' has no truth; {alone}")
+            raise InputError(f"--axes {','.join(r.components.axes or ())}: '{axis}' has no truth; {alone}")
 
 
 def position_note(truth: Path | str, lever_arm: Sequence[float] | None) -> str:
@@ -206,7 +206,7 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
         truth=true.values[:, 1:4],
         manifold="vector",
         convention="vector",
-        max_dt=r.tolerance,
+        max_dt=r.matching.tolerance,
         true_covariance=of_truth,
     )
 

@@ -135,18 +135,20 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     """
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
-    if r.columns or r.world or r.body_axes:  # names and axes of the file are not those of the record
+    declared = r.conventions
+    if r.components.columns or declared.world or declared.body_axes:  # names and axes of the file are not the record's
         return []
+    state = r.components.state
     found: list[TextFile | None] = []
-    if estimates.is_dir() and table_files(estimates) and (r.state or not trajectory_files(estimates)):
+    if estimates.is_dir() and table_files(estimates) and (state or not trajectory_files(estimates)):
         for run, path in enumerate(table_files(estimates)):
             found.append(_table(path, r, name, run))
-    elif estimates.is_file() and estimates.suffix.lower() == ".csv" and (r.state or not is_spatial(estimates)):
+    elif estimates.is_file() and estimates.suffix.lower() == ".csv" and (state or not is_spatial(estimates)):
         found.append(_table(estimates, r, name))
     elif is_plane(estimates):
         return []
     else:
-        for run, (own, _, covariance) in enumerate(files_of_runs(estimates, r, r.covariance)):
+        for run, (own, _, covariance) in enumerate(files_of_runs(estimates, r, r.sources.covariance)):
             found.append(_trajectory(own, run, r) if covariance is None else _numbers(covariance, 1, run, r))
     known = [each for each in found if each is not None]
     return known if len(known) == len(found) else []
@@ -157,22 +159,22 @@ def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFil
     head = head_of(path)
     if head is None or any(column.startswith("own_P") for column in head.names):
         return None
-    axes = r.state or POSE
+    axes = r.components.state or POSE
     covariance = covariance_columns(head.names, axes)
     added = {}
     for i, j in itertools.combinations_with_replacement(range(len(axes)), 2):
         added[entry_name(axes, i, j)] = (axes[i], axes[j])
     if covariance.places:
         added = {}
-    elif not r.unstated or head.comment or not set(axes) <= set(head.names):
+    elif not r.statement.unstated or head.comment or not set(axes) <= set(head.names):
         return None
     components = {place: (axes[i], axes[j]) for (i, j), place in covariance.places.items()}
     places = {column: place for place, column in enumerate(head.names)}
     run_column = by_column = None
     if run is None:
         run_column = places.get("run")
-    if r.by is not None and r.by_file is None:
-        by_column = places.get(r.by)
+    if r.groups.own_column is not None:
+        by_column = places.get(r.groups.own_column)
     squared = covariance.squared or bool(added)
     return TextFile(path, components, squared, run or 0, run_column, places.get("filter"), name, by_column, added)
 
@@ -197,7 +199,7 @@ def _numbers(path: Path, first: int, run: int, r: Reading) -> TextFile | None:
                 width = len(fields_of(line))
                 break
     many = width - first
-    if many == 0 and r.unstated:
+    if many == 0 and r.statement.unstated:
         return TextFile(path, {}, True, run, added={f"P {a} {b}": (a, b) for a in STATE[:6] for b in STATE[:6]})
     if many not in (6, TRIANGLE, FULL):
         return None
@@ -210,7 +212,7 @@ def _of_columns(path: Path, columns: Sequence[int], run: int, r: Reading, square
     n = components_in(many)
     if n is None:
         return None
-    order = covariance_order(n, r.covariance_order or ORDERS[0])
+    order = covariance_order(n, r.conventions.covariance_order or ORDERS[0])
     names = [STATE[order.index(place)] for place in range(n)]
     pairs = list(itertools.combinations_with_replacement(names, 2))
     if many == n * n:

@@ -63,17 +63,17 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
         bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
         return [poses_without_covariances(path, [_bare_run(bag, r) for bag in counted(bags, *READING)], r)]
-    if r.relative is not None:
+    if r.runs.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
-    require_spatial(r.error, SPATIAL)
+    require_spatial(r.conventions.error, SPATIAL)
     _require_whole(path, bags)
     why = "; as the ROS messages define it; declare yours with --error"
     mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
     found = space_estimator(path, (_run_of(bag, r) for bag in counted(bags, *READING)), r, why, mixed)
-    if r.unstated and not any(one.covariance.any() for one in found.runs):
+    if r.statement.unstated and not any(one.covariance.any() for one in found.runs):
         return [found]
     judged, note = _stated(path, found.runs)
-    if r.axes is not None or not note:
+    if r.components.axes is not None or not note:
         return [found]
     return [replace(found, judged=judged, notes=(*found.notes, note))]
 
@@ -94,21 +94,22 @@ def _require_whole(path: Path, bags: Sequence[Path]) -> None:
 def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
-        run = _run_on(bag, reader, r, _chosen(bag, reader, r.topic), ", of poses or PARENT:CHILD of /tf")
+        run = _run_on(bag, reader, r, _chosen(bag, reader, r.sources.topic), ", of poses or PARENT:CHILD of /tf")
     numbers = 4 if isinstance(run.true, Fixes) else POSE_NUMBERS  # of a row before its covariance
-    if r.truth_covariance not in (None, COLUMNS):
-        raise InputError(f"--truth-covariance {r.truth_covariance}: with a bag it is '{COLUMNS}', of the messages")
-    if r.truth_covariance is not None and not (run.true.values[:, numbers:] > 0).any():
-        raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.truth_topic} state none")
+    of_truth = r.truth.truth_covariance
+    if of_truth not in (None, COLUMNS):
+        raise InputError(f"--truth-covariance {of_truth}: with a bag it is '{COLUMNS}', of the messages")
+    if of_truth is not None and not (run.true.values[:, numbers:] > 0).any():
+        raise InputError(f"{bag}: --truth-covariance {COLUMNS}: the messages of {r.sources.truth_topic} state none")
     if not np.isfinite(run.true.values[:, 1:numbers]).all():
-        raise InputError(f"{bag}: the truth on {r.truth_topic} is not finite")
+        raise InputError(f"{bag}: the truth on {r.sources.truth_topic} is not finite")
     return run
 
 
 def _bare_run(bag: Path, r: Reading) -> SpaceRun:
     """Poses of a bag, of a topic with or without covariances."""
     with _opened(bag) as reader:
-        topic = r.topic
+        topic = r.sources.topic
         if topic not in _topics(reader, POSES):
             topic = _chosen(bag, reader, topic)
         run = _run_on(bag, reader, r, topic)
@@ -119,7 +120,7 @@ def _bare_run(bag: Path, r: Reading) -> SpaceRun:
 
 def _run_on(bag: Path, reader: Any, r: Reading, topic: str, needed: str = "") -> SpaceRun:
     """A run on a topic beside that of the truth; ``needed`` says in a message what the latter may be."""
-    truth = r.truth_topic
+    truth = r.sources.truth_topic
     if truth is None:
         there = [name for name in _topics(reader, POSES) if name != topic]
         raise InputError(f"{bag}: needs --truth-topic{needed}; there are: {_listed(there, reader)}")

@@ -45,14 +45,15 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
     InputError
         A file, column, line or option that cannot be used, and what is allowed.
     """
-    if r.state is not None and (len(set(r.state)) < len(r.state) or not all(r.state)):
-        raise InputError(f"--state {','.join(r.state)}: needs names of columns, each once")
-    axes = tuple(r.members or r.state or _own_state(estimates, r) or POSE)
+    state = r.components.state
+    if state is not None and (len(set(state)) < len(state) or not all(state)):
+        raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
+    axes = tuple(r.components.members or state or _own_state(estimates, r) or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
-    if r.state is None and axes != tuple(POSE):
-        what = "covariance P_* says" if r.level is None else "bounds say"
+    if state is None and axes != tuple(POSE):
+        what = "covariance P_* says" if r.statement.level is None else "bounds say"
         notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its {what}; --state names another")
-    convention = _convention(r.error, axes, truth) if r.members is None else "vector"
+    convention = _convention(r.conventions.error, axes, truth) if r.components.members is None else "vector"
     _require_truth(sheet, truth, axes, convention, r)
     key = _key(sheet, truth, r)
     of_filters = {sheet.path.stem: sheet}
@@ -61,7 +62,7 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
         of_filters = {name: sheet.rows(filters == name) for name in dict.fromkeys(filters)}
     found = []
     for name, own in of_filters.items():
-        true = truth if r.truth is not None else columns.true_columns(own, axes)
+        true = truth if r.sources.truth is not None else columns.true_columns(own, axes)
         if true is None:
             found.append(_innovations(name, own, key, axes))
         else:
@@ -74,30 +75,30 @@ def _both(
     estimates: Path | TableRows, axes: tuple[str, ...], r: Reading
 ) -> tuple[TableRows, TableRows | None, list[str]]:
     """Estimates and truth, which may stand beside them, with times where steps do not number both, and notes."""
-    sheet, read_as = _sheet(estimates, axes, r.columns, bool(r.motions))
+    sheet, read_as = _sheet(estimates, axes, r.components.columns, bool(r.runs.motions))
     notes = [sheet.cut, read_as]
     truth = None
-    if r.members is not None:
+    if r.components.members is not None:
         from consistency.referee.readers.formats.members import with_means
 
-        sheet = with_means(sheet, r.members)
-    if r.repeats:
+        sheet = with_means(sheet, r.components.members)
+    if r.sources.repeats:
         from consistency.referee.readers.formats.members import beside_first_run
 
         sheet, truth = beside_first_run(sheet, axes)
-    elif r.truth is not None:
-        truth, read_as = _sheet(r.truth, axes, r.truth_columns, body=r.body)
+    elif r.sources.truth is not None:
+        truth, read_as = _sheet(r.sources.truth, axes, r.components.truth_columns, body=r.sources.body)
         notes = [sheet.cut, truth.cut, notes[1], read_as]
-    if r.level is not None:
+    if r.statement.level is not None:
         from consistency.referee.readers.formats.bounds import with_centres
 
         sheet = with_centres(sheet)
     sheet, truth, by_name = columns.paired_by_name(sheet, truth, axes)
     is_alone = truth is None and columns.true_columns(sheet, axes) is None
-    sheet, of_nis = columns.with_nis(sheet, r.dof, required=is_alone)
+    sheet, of_nis = columns.with_nis(sheet, r.statement.dof, required=is_alone)
     notes += by_name, of_nis
     by_step = "step" in sheet and (truth is None or "step" in truth)
-    if not by_step or r.time_offset is not None or r.max_dt is not None:
+    if not by_step or r.matching.time_offset is not None or r.matching.max_dt is not None:
         sheet = columns.with_clock(sheet)
         if truth is not None:
             truth = columns.with_clock(truth)
@@ -114,18 +115,18 @@ def _both(
 def _own_state(table: Path | TableRows, r: Reading) -> list[str]:
     """The state of a table of estimates that names it in its covariance or its bounds; none of poses."""
     if isinstance(table, TableRows):
-        names = list(table.renamed(r.columns).data)
+        names = list(table.renamed(r.components.columns).data)
     elif table.suffix.lower() == ".csv":
-        head = head_of(table, r.columns)
+        head = head_of(table, r.components.columns)
         names = [] if head is None else head.names
     else:
-        names = [] if r.level is None else list(read_sheet(table, r.columns).data)
-    if r.level is not None:
+        names = [] if r.statement.level is None else list(read_sheet(table, r.components.columns).data)
+    if r.statement.level is not None:
         from consistency.referee.readers.formats.bounds import require_gaussian, state_of_bounds
 
         if state := state_of_bounds(names):
             return state
-        require_gaussian(str(table.path if isinstance(table, TableRows) else table), r)
+        require_gaussian(str(table.path if isinstance(table, TableRows) else table), r.statement)
     state = columns.stated_state(names)
     if not state and not covariance_columns(names, POSE).places and not columns.has_nis(names):
         _require_no_bounds(table.path if isinstance(table, TableRows) else table, names)
@@ -189,12 +190,12 @@ def _require_truth(
     sheet: TableRows, truth: TableRows | None, axes: tuple[str, ...], convention: str, r: Reading
 ) -> None:
     """Refuse options that need a truth, or poses, where there are none."""
-    if r.relative is not None and truth is None:
+    if r.runs.relative is not None and truth is None:
         raise InputError(f"{sheet.path}: --relative needs --truth FILE, poses in any world")
-    if r.relative is not None and (not is_pose(axes) or convention == "vector"):
+    if r.runs.relative is not None and (not is_pose(axes) or convention == "vector"):
         raise InputError(f"{sheet.path}: --relative needs poses x, y, heading, with --error so2, left or right")
-    if r.align is not None and convention == "vector":
-        raise InputError(f"--align {r.align}: needs poses x,y,heading, and an error that is not 'vector'")
+    if r.matching.align is not None and convention == "vector":
+        raise InputError(f"--align {r.matching.align}: needs poses x,y,heading, and an error that is not 'vector'")
     if truth is None and not sheet.has("nis", "nis_dof"):
         others = (
             "columns nis and nis_dof, or innovation and innovation_variance, to be judged by the NIS alone, or columns "
@@ -207,8 +208,9 @@ def _require_truth(
         if missing:
             raise InputError(f"{sheet.path}: {missing}")
         raise InputError(f"{sheet.path}: needs --truth FILE, or {others}{state}")
-    if r.truth_covariance not in (None, COLUMNS):
-        raise InputError(f"--truth-covariance {r.truth_covariance}: for tables it is '{COLUMNS}', those of the truth")
+    of_truth = r.truth.truth_covariance
+    if of_truth not in (None, COLUMNS):
+        raise InputError(f"--truth-covariance {of_truth}: for tables it is '{COLUMNS}', those of the truth")
 
 
 def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
@@ -216,7 +218,7 @@ def _key(sheet: TableRows, truth: TableRows | None, r: Reading) -> str:
     true = sheet if truth is None else truth
     timed = truth is not None and "t" in sheet and "t" in truth
     key = next((key for key in ("step", "t") if key in sheet and key in true), None)
-    if r.time_offset is not None:
+    if r.matching.time_offset is not None:
         key = "t"
     for option in ("time_offset", "max_dt"):
         if r.given([option]) and key is not None and not timed:
@@ -282,18 +284,19 @@ def _estimator(
     notes = _absent(name, truth, runs, true_runs)
     stated = WHOLE
     cross = of_truth = bounds = sizes = None
-    is_stated = not r.unstated or covariance_columns(list(sheet.data), axes).places
-    if not poses_alone and r.members is None and is_stated:
+    is_stated = not r.statement.unstated or covariance_columns(list(sheet.data), axes).places
+    if not poses_alone and r.components.members is None and is_stated:
         covariance, stated, bounds, sizes, note = _stated(name, sheet, axes, convention, r)
         known = np.ones(len(sheet), bool)
         notes += filter(None, [note])
-    if r.relative is not None and not r.motions:
+    if r.runs.relative is not None and not r.runs.motions:
         cross = columns.stated_cross_covariances(sheet)
     own_of_truth = covariance_columns(list(truth.data), axes)
-    if r.truth is not None and r.truth_covariance is None and columns.states_any(truth, own_of_truth, len(axes)):
+    is_unused = r.sources.truth is not None and r.truth.truth_covariance is None
+    if is_unused and columns.states_any(truth, own_of_truth, len(axes)):
         notes.append(f"{truth.path}: the truth states a covariance of its own, which counts as 0; see "
                      f"--truth-covariance {COLUMNS}")  # fmt: skip
-    if r.truth_covariance is not None:
+    if r.truth.truth_covariance is not None:
         of_truth = columns.stated_covariance(truth, axes, own_of_truth)
     estimate = sheet.matrix(axes)
     estimate[~finite_rows(estimate)] = np.nan
@@ -309,7 +312,7 @@ def _estimator(
         truth=truth.matrix(axes, finite=True),
         manifold=manifold_of(convention),
         convention=convention,
-        max_dt=0.0 if by_step else r.tolerance,
+        max_dt=0.0 if by_step else r.matching.tolerance,
         cross=cross,
         true_covariance=of_truth,
         files=(sheet.path, truth.path),
@@ -319,12 +322,12 @@ def _estimator(
         nis=nis,
         nis_dof=dof,
         bounds=sizes,
-        by=columns.own_column(sheet, r),
+        by=columns.own_column(sheet, r.groups),
     )
-    if r.members is not None:
+    if r.components.members is not None:
         from consistency.referee.readers.formats.members import member_columns
 
-        poses = replace(poses, members=member_columns(sheet, r.members))
+        poses = replace(poses, members=member_columns(sheet, r.components.members))
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
         of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
@@ -338,7 +341,7 @@ def _estimator(
         name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,
         position=_position(axes), bounds=bounds,
     )  # fmt: skip
-    if r.members is None:
+    if r.components.members is None:
         return found
     from consistency.referee.readers.formats.members import of_members
 
@@ -374,17 +377,17 @@ def _stated(
     name: str, sheet: TableRows, axes: tuple[str, ...], convention: str, r: Reading
 ) -> tuple[Array, Stated, Bounds | None, Array | None, str]:
     """Covariances (N, n, n), which of them are stated, bounds in place of them and their sizes, and a note."""
-    if r.level is None:
+    if r.statement.level is None:
         covariance, stated, note = _covariance(name, sheet, axes, convention)
         return covariance, stated, None, None, note
     from consistency.referee.readers.formats import bounds
 
-    found = bounds.stated_in(sheet, axes, r)
+    found = bounds.stated_in(sheet, axes, r.statement)
     if found is not None:
         return bounds.covariance_of(*found, len(axes)), WHOLE, *found, ""
-    bounds.require_gaussian(str(sheet.path), r)
+    bounds.require_gaussian(str(sheet.path), r.statement)
     covariance, stated, note = _covariance(name, sheet, axes, convention)
-    return covariance * bounds.covariance_factor(r), stated, None, None, note
+    return covariance * bounds.covariance_factor(r.statement), stated, None, None, note
 
 
 def _covariance(name: str, sheet: TableRows, axes: tuple[str, ...], convention: str) -> tuple[Array, Stated, str]:

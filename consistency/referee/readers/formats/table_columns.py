@@ -32,7 +32,7 @@ from consistency.referee.readers.formats.columns import (
 from consistency.referee.readers.formats.file_kinds import fields_of
 from consistency.referee.readers.formats.sheet import DOF_NEEDED, NIS_DOF, TableRows, are_dof, checked_dof
 from consistency.referee.readers.formats.text_blocks import FileRows, blocks
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import GroupOptions
 from consistency.referee.readers.places import exact, listed, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.types import Array, Indices
@@ -316,14 +316,15 @@ def stated_cross_covariances(sheet: TableRows) -> Array | None:
     return sheet.matrix(columns).reshape(-1, 3, 3)
 
 
-def own_column(sheet: TableRows, r: Reading) -> Array | None:
+def own_column(sheet: TableRows, options: GroupOptions) -> Array | None:
     """Cells of the column of ``--by``, (N,); None where it is of another file, or not asked for."""
-    if r.by is None or r.by_file is not None:
+    by = options.own_column
+    if by is None:
         return None
-    if r.by not in sheet:
+    if by not in sheet:
         hint = "a table with t or run and the column goes with --by-file"
-        raise InputError(f"--by {r.by}: {sheet.path} has no such column; there are: {sheet.columns}; {hint}")
-    return sheet.data[r.by]
+        raise InputError(f"--by {by}: {sheet.path} has no such column; there are: {sheet.columns}; {hint}")
+    return sheet.data[by]
 
 
 def nis_columns(sheet: TableRows) -> tuple[Array | None, Array | None]:

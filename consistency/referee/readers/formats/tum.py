@@ -40,7 +40,7 @@ from consistency.referee.readers.formats.positions import (
     require_positions,
 )
 from consistency.referee.readers.formats.text_blocks import Lines
-from consistency.referee.readers.options import COLUMNS, Reading, flag_of
+from consistency.referee.readers.options import COLUMNS, GroupOptions, Reading, flag_of
 from consistency.referee.readers.places import listed, one_of_each_kind, refuse
 from consistency.referee.readers.runs_to_record import symmetric
 from consistency.referee.readers.truth_matching import (
@@ -87,15 +87,15 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     ----------
     poses_alone : covariances are not looked at
     """
-    stated_as.require_spatial(r.error, INERTIAL)
+    stated_as.require_spatial(r.conventions.error, INERTIAL)
     truth_of = _truths(estimates, r)
-    files = files_of_runs(estimates, r, None if poses_alone else r.covariance)
+    files = files_of_runs(estimates, r, None if poses_alone else r.sources.covariance)
     runs = (_run_of(own, true, P, truth_of, r) for own, true, P in counted(files, "reading", "files"))
     return [poses_without_covariances(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
 
 
 def _run_of(own: Path, true: Path, covariance: Path | None, truth_of: Callable[[Path], Lines], r: Reading) -> SpaceRun:
-    lines = read_trajectory(own, columns=r.columns)
+    lines = read_trajectory(own, columns=r.components.columns)
     return SpaceRun(lines, truth_of(true), (own, true), covariance)
 
 
@@ -132,21 +132,21 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         notes.append(unjudged)
         poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end()))
     assert layout is not None
-    if poses[0].manifold == "spatial" and r.axes is None and r.relative is None:
+    if poses[0].manifold == "spatial" and r.components.axes is None and r.runs.relative is None:
         is_empty, what = placeholder(poses)
         if what:
             notes.append(f"{layout.files[1]}: {what}")
         if is_empty:
-            poses = [point_positions(one, r.lever_arm, layout.stated != WHOLE) for one in poses]
+            poses = [point_positions(one, r.matching.lever_arm, layout.stated != WHOLE) for one in poses]
     if any(one.manifold == "vector" for one in poses):
         require_positions(path, poses, r)
-    elif r.lever_arm is not None:
+    elif r.matching.lever_arm is not None:
         raise InputError("--lever-arm: goes with a truth of positions alone; this one has the orientation of its body")
     kind = poses[0].convention
     if kind == "vector" and layout.convention:
-        notes.append(position_note(layout.files[1], r.lever_arm))
+        notes.append(position_note(layout.files[1], r.matching.lever_arm))
         why = f"; of the position, whose covariance follows from that of the error {layout.convention}"
-    elif r.error is not None:
+    elif r.conventions.error is not None:
         why = ""
     elif not why:
         why = f"; the default of this layout, {_origin(layout.stated)}"
@@ -161,7 +161,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         definition,
         layout.stated,
         label=path.name,
-        covariances=r.covariance,
+        covariances=r.sources.covariance,
         notes=one_of_each_kind(notes),
         in_space=True,
         position=3,
@@ -177,13 +177,13 @@ def _layout_of(own: Lines, files: Files, r: Reading) -> Layout:
         An option does not go with it.
     """
     stated = _stated(own)
-    stated_as.require_error(own, r.error)
-    if stated not in (WHOLE, ALONE) and r.covariance_order not in (None, ORDERS[1]):
+    stated_as.require_error(own, r.conventions.error)
+    if stated not in (WHOLE, ALONE) and r.conventions.covariance_order not in (None, ORDERS[1]):
         raise InputError(f"--covariance-order: {files[0]} is {OPENVINS}, rotation before translation")
     if isinstance(own, Fixes):
         return Layout(stated, "", files)
     default = "so3" if stated in (WHOLE, ALONE) else "so3-body"
-    return Layout(stated, r.error or default, files)
+    return Layout(stated, r.conventions.error or default, files)
 
 
 def _stated(own: Lines) -> Stated:
@@ -234,32 +234,33 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     """The poses of a run, or positions where these alone have a truth, and a note on what is not judged."""
     own = run.own
     true = run.true
-    by = _own_column(own, r)
+    by = _own_column(own, r.groups)
     if isinstance(own, Fixes):
         return replace(fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), by=by), ""
     k, note = judged_rest(own, true, r)
-    order = r.covariance_order or ORDERS[0]
+    order = r.conventions.covariance_order or ORDERS[0]
     P, known = unstated(len(own.t), 6 + k)
     cross = None
-    if not r.unstated or run.covariance is not None or stated_as.covariances_in(own, order) is not None:
-        P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.tolerance)
+    if not r.statement.unstated or run.covariance is not None or stated_as.covariances_in(own, order) is not None:
+        P, known, cross = _covariances(own, run.covariance, 6 + k, order, r.matching.tolerance)
     of_truth = _of_truth(true, own, order, r)
     run = replace(run, own=own.of(slice(0, POSE_NUMBERS)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
     poses = replace(poses, cross=cross, true_covariance=of_truth, by=by)
     if _is_point(true):
-        poses = point_positions(poses, r.lever_arm, layout.stated != WHOLE)
+        poses = point_positions(poses, r.matching.lever_arm, layout.stated != WHOLE)
     return poses, note
 
 
-def _own_column(own: Lines, r: Reading) -> Array | None:
+def _own_column(own: Lines, options: GroupOptions) -> Array | None:
     """Cells of the column of ``--by``, (N,); None where the file has no columns, or the column is of another one."""
-    if r.by is None or r.by_file is not None or not own.columns:
+    by = options.own_column
+    if by is None or not own.columns:
         return None
-    if r.by not in own.columns:
+    if by not in own.columns:
         has = f"has no such column; there are: {listed(list(own.columns), 12)}"
-        raise InputError(f"--by {r.by}: {own.path} {has}; a table with t and the column goes with --by-file")
-    return own.columns[r.by]
+        raise InputError(f"--by {by}: {own.path} {has}; a table with t and the column goes with --by-file")
+    return own.columns[by]
 
 
 def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: str, r: Reading) -> Poses:
@@ -276,7 +277,7 @@ def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: 
         truth=_states(true, k),
         manifold="spatial",
         convention=convention,
-        max_dt=r.tolerance,
+        max_dt=r.matching.tolerance,
         name=own.path.stem,
         files=run.files,
     )
@@ -345,18 +346,18 @@ def judged_rest(own: Lines, true: Lines, r: Reading) -> tuple[int, str]:
 def _unused(truth: Lines, r: Reading) -> str:
     """A note on a covariance of the truth that nothing is done with, "" without one."""
     stated = isinstance(truth, Fixes) or bool((truth.values[:, POSE_NUMBERS:] > 0).any())
-    if r.truth_covariance is not None or not stated or isinstance(truth, States):
+    if r.truth.truth_covariance is not None or not stated or isinstance(truth, States):
         return ""
     return f"{truth.path}: the truth states a covariance of its own, which counts as 0; see --truth-covariance columns"
 
 
 def _of_truth(truth: Lines, own: Lines, order: str, r: Reading) -> Array | None:
     """Covariance of the truth, (M, 6, 6) or of fixes (M, 3, 3): of its columns, or of a file; NaN without one."""
-    if r.truth_covariance is None:
+    if r.truth.truth_covariance is None:
         return None
-    if r.truth_covariance != COLUMNS:
-        path = paired(Path(r.truth_covariance), own.path, "--truth-covariance")
-        return stated_as.from_file(truth, path, order, r.tolerance)
+    if r.truth.truth_covariance != COLUMNS:
+        path = paired(Path(r.truth.truth_covariance), own.path, "--truth-covariance")
+        return stated_as.from_file(truth, path, order, r.matching.tolerance)
     P = truth.covariances if isinstance(truth, Fixes) else stated_as.covariances_in(truth, order)
     if P is None:
         raise InputError(f"--truth-covariance {COLUMNS}: {truth.path} has none; give a file of t and {FULL} numbers")
@@ -371,9 +372,11 @@ def _truths(estimates: Path, r: Reading) -> Callable[[Path], Lines]:
 
     @lru_cache(maxsize=1)
     def read(path: Path) -> Lines:
-        if r.truth is not None:
-            return read_drive(path, r.body) if is_drive(path) else read_trajectory(path, True, r.truth_columns)
-        beside = read_beside(path, r.columns)
+        if r.sources.truth is not None:
+            if is_drive(path):
+                return read_drive(path, r.sources.body)
+            return read_trajectory(path, True, r.components.truth_columns)
+        beside = read_beside(path, r.components.columns)
         if beside is None:
             raise InputError(f"{estimates}: a trajectory needs --truth FILE, the true one in the same form")
         return _checked(beside)

@@ -48,7 +48,7 @@ def record_of_arrays(
     """
     first = next(iter(given))
     are_repeats = first == "estimates"
-    reading = replace(reading or Reading(), independent=(independent and not are_repeats) or None)
+    reading = (reading or Reading()).with_options(independent=(independent and not are_repeats) or None)
     arrays = {key: in_memory(key, value) for key, value in given.items()}
     if independent:
         if arrays[first].ndim == 3 and first == "errors":  # of runs whose steps are independent, too
@@ -109,11 +109,11 @@ def record_of_arrays(
             (record,) = records_of(record, reading)
         if sigma is not None and not record.errors.bounds:
             record = each_alone(record)
-        if reading.ensemble is not None or are_repeats:
+        if reading.statement.ensemble is not None or are_repeats:
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
 
             record = of_repeats(record) if are_repeats else record
-            record = record if reading.ensemble is None else of_ensemble(record, reading.ensemble)
+            record = record if reading.statement.ensemble is None else of_ensemble(record, reading.statement.ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
     failures = tuple(replace(failure, filter=name) for failure in record.failures)

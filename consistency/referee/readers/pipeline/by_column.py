@@ -21,7 +21,7 @@ from consistency.referee.diagnostics.records.groups import (
 )
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.errors import InputError
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import GroupOptions
 from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, evenly, submatrices
 from consistency.referee.types import Array, Indices
 
@@ -33,7 +33,7 @@ NO_TRUTH = "has no truth, so that there are no errors to group"
 NO_COLUMNS = "has no columns of its own; --by-file FILE names a table with the column and t or run"
 
 
-def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estimator, Column]:
+def with_values(e: Estimator, options: GroupOptions, judged: Sequence[int]) -> tuple[Estimator, Column]:
     """The estimator with the values of the column in each row, and the column of all rows.
 
     Raises
@@ -41,16 +41,16 @@ def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estima
     InputError
         There are no errors, or the files have no such column, or no time at which to look it up.
     """
-    assert r.by is not None
+    assert options.by is not None
     if e.innovations_alone:
-        raise InputError(f"--by {r.by}: {e.path} {NO_TRUTH}")
+        raise InputError(f"--by {options.by}: {e.path} {NO_TRUTH}")
     cells = [p.by for p in e.runs if p.by is not None]
-    if r.by_file is not None:
-        sheet = _sheet(r)
-        cells = [_looked_up(sheet, r.by, p.run, p.seconds) for p in e.runs]
+    if options.by_file is not None:
+        sheet = _sheet(options)
+        cells = [_looked_up(sheet, options.by, p.run, p.seconds) for p in e.runs]
     if len(cells) < len(e.runs):
-        raise InputError(f"--by {r.by}: {e.path} {NO_COLUMNS}")
-    column = column_of(r.by, np.concatenate(cells))
+        raise InputError(f"--by {options.by}: {e.path} {NO_COLUMNS}")
+    column = column_of(options.by, np.concatenate(cells))
     column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
     runs = []
     start = 0
@@ -62,7 +62,7 @@ def with_values(e: Estimator, r: Reading, judged: Sequence[int]) -> tuple[Estima
 
 
 def in_groups(
-    records: Sequence[Record], column: Column, e: Estimator, pairs: Sequence[Poses], r: Reading
+    records: Sequence[Record], column: Column, e: Estimator, pairs: Sequence[Poses], options: GroupOptions
 ) -> list[Record]:
     """The records of an estimator with their groups.
 
@@ -78,7 +78,7 @@ def in_groups(
     if pairs:
         axes = itertools.chain.from_iterable(record.errors.axes for record in records)
         column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
-    return [grouped(record, column, r) for record in records]
+    return [grouped(record, column, options) for record in records]
 
 
 def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: Sequence[Poses]) -> Column:
@@ -122,7 +122,7 @@ def _sizes(record: Record) -> Array | None:
     return np.asarray(np.square(record.errors.bound_ratios).sum(axis=-1))
 
 
-def grouped(record: Record, column: Column, r: Reading, option: str = "--by") -> Record:
+def grouped(record: Record, column: Column, options: GroupOptions, option: str = "--by") -> Record:
     """The record with its groups.
 
     Raises
@@ -135,7 +135,7 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
     sizes = _sizes(record)
     if sizes is None:
         raise InputError(f"{option} {column.name}: {record.name} {NO_TRUTH}")
-    if column.words and r.bins is not None:
+    if column.words and options.bins is not None:
         flag = option.replace("by", "bins")
         raise InputError(f"{flag}: {column.name} holds words, each of which is a group; leave the option out")
     counted = np.isfinite(sizes)
@@ -153,14 +153,14 @@ def grouped(record: Record, column: Column, r: Reading, option: str = "--by") ->
             "only called so"
         )
     try:
-        bins = BINS if r.bins is None else r.bins
+        bins = BINS if options.bins is None else options.bins
         groups = groups_of(replace(column, values=record.runs.by), bins, counted)
     except ValueError as wrong:
         raise InputError(f"{option} {column.name}: {wrong}") from None
     return replace(record, groups=groups)
 
 
-def record_in_groups(record: Record, r: Reading) -> Record:
+def record_in_groups(record: Record, options: GroupOptions) -> Record:
     """A record that its reader has made, with its groups.
 
     Raises
@@ -168,24 +168,24 @@ def record_in_groups(record: Record, r: Reading) -> Record:
     InputError
         The files have no such column, or as :func:`grouped`.
     """
-    assert r.by is not None
+    assert options.by is not None
     cells = record.runs.by
-    if r.by_file is not None:
-        sheet = _sheet(r)
-        of_runs = [_looked_up(sheet, r.by, int(run), record.runs.t) for run in record.run_numbers]
+    if options.by_file is not None:
+        sheet = _sheet(options)
+        of_runs = [_looked_up(sheet, options.by, int(run), record.runs.t) for run in record.run_numbers]
         cells = np.stack(of_runs)
     if cells is None:
-        raise InputError(f"--by {r.by}: {record.name} {NO_COLUMNS}")
-    return _by_cells(record, r.by, cells, r)
+        raise InputError(f"--by {options.by}: {record.name} {NO_COLUMNS}")
+    return _by_cells(record, options.by, cells, options)
 
 
-def _by_cells(record: Record, name: str, cells: Array, r: Reading, option: str = "--by") -> Record:
+def _by_cells(record: Record, name: str, cells: Array, options: GroupOptions, option: str = "--by") -> Record:
     """The record with groups of the cells of a column, (runs, steps)."""
     column = column_of(name, cells)
     column = replace(
         column, outcome=selects_on_outcome(column, record.errors.axes, covariance=record.errors.covariance)
     )
-    return grouped(replace(record, runs=replace(record.runs, by=column.values)), column, r, option)
+    return grouped(replace(record, runs=replace(record.runs, by=column.values)), column, options, option)
 
 
 def with_groups(
@@ -212,13 +212,13 @@ def with_groups(
         cells = on_steps(values, sizes.shape)
     except ValueError as wrong:
         raise InputError(f"by: {wrong}") from None
-    return _by_cells(record, name, cells, Reading(bins=bins), "by")
+    return _by_cells(record, name, cells, GroupOptions(bins=bins), "by")
 
 
 # --- a table of its own -------------------------------------------------------------------------------
 
 
-def _sheet(r: Reading) -> TableRows:
+def _sheet(options: GroupOptions) -> TableRows:
     """The table of ``--by-file``, with the column and what it is looked up by.
 
     Raises
@@ -229,13 +229,13 @@ def _sheet(r: Reading) -> TableRows:
     from consistency.referee.readers.formats.sheet import read_sheet
     from consistency.referee.readers.formats.table_columns import with_clock
 
-    assert r.by is not None
-    assert r.by_file is not None
-    sheet = with_clock(read_sheet(r.by_file), required=False)
-    if r.by not in sheet:
-        raise InputError(f"--by {r.by}: {r.by_file} has no such column; there are: {sheet.columns}")
+    assert options.by is not None
+    assert options.by_file is not None
+    sheet = with_clock(read_sheet(options.by_file), required=False)
+    if options.by not in sheet:
+        raise InputError(f"--by {options.by}: {options.by_file} has no such column; there are: {sheet.columns}")
     if "t" not in sheet and "run" not in sheet:
-        raise InputError(f"{r.by_file}: column 't' or 'run' is missing; there are: {sheet.columns}")
+        raise InputError(f"{options.by_file}: column 't' or 'run' is missing; there are: {sheet.columns}")
     return sheet
 
 

@@ -28,7 +28,7 @@ from consistency.referee.readers.formats.columns import TRUE, stem_of
 from consistency.referee.readers.formats.file_kinds import TRAJECTORIES, head_of, paired, table_files
 from consistency.referee.readers.formats.table import read_tables
 from consistency.referee.readers.formats.table_columns import has_nis
-from consistency.referee.readers.options import Reading, flag_of
+from consistency.referee.readers.options import Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import CutNote, Places, listed
 from consistency.referee.readers.truth_matching import OF_ESTIMATES, OF_TRUTH, Estimator, Poses, Stated
@@ -124,7 +124,7 @@ class ProgramStudy:
         for name in PATHS:
             if name in given:
                 given[name] = Path(given[name])
-        return Reading(**given)
+        return make_reading(**given)
 
     @property
     def estimates(self) -> str:
@@ -166,16 +166,17 @@ class ProgramStudy:
         """
         own: dict[str, Any] = {}
         for name in r.given(PATHS):
-            path = str(getattr(r, name))
+            path = str(r.option(name))
             base = run.folder
             if "input" in run.values and is_recorded(path):
                 base = Path(run.values["here"])
             own[name] = base / filled(path, run.known)
         estimates = run.folder / filled(self.estimates, run.known)
         beside = run.folder / f"truth{estimates.suffix}"
-        if r.truth is None and r.truth_topic is None and beside.is_file() and _needs_truth(estimates, r):
+        named = r.given(("truth", "truth_topic"))
+        if not named and beside.is_file() and _needs_truth(estimates, r):
             own["truth"] = beside
-        return estimates, replace(r, **own)
+        return estimates, r.with_options(**own)
 
 
 def study_in(folder: Path) -> ProgramStudy:
@@ -198,8 +199,7 @@ def with_options(study: ProgramStudy, r: Reading) -> Reading:
     deleted = [name for name in r.given() if name not in OF_NUMBERS]
     if deleted and any(study.folder.glob(f"runs/*/{NUMBERS}")):
         raise InputError(f"{flag_of(deleted[0])}: {study.folder} has the numbers alone that were read (--keep failed)")
-    given = {name: getattr(r, name) for name in r.given()}
-    return replace(study.reading, **{name: value for name, value in given.items() if value})
+    return study.reading.with_options(**{name: value for name, value in r.as_options().items() if value})
 
 
 # --- from runs to estimators -----------------------------------------------------------------------
@@ -264,7 +264,7 @@ class ProgramRuns:
         estimates, r = self.study.files_of(run, self.options)
         if not (run.folder / NUMBERS).exists():
             keep_numbers(run.folder, self.found[run.run])
-        for path in (estimates, r.truth, r.covariance):
+        for path in (estimates, r.sources.truth, r.sources.covariance):
             if path is None or not path.is_relative_to(run.folder):
                 continue
             if path.is_dir():
@@ -299,13 +299,14 @@ class ProgramRuns:
         if (run.folder / NUMBERS).exists():
             return kept_numbers(run.folder)
         estimates, r = self.study.files_of(run, self.options)
-        for path, option in ((estimates, "--estimates"), (r.truth, "--truth"), (r.covariance, "--covariance")):
+        paths = {"--estimates": estimates, "--truth": r.sources.truth, "--covariance": r.sources.covariance}
+        for option, path in paths.items():
             if path is not None and not path.exists():
                 raise InputError(_nothing(path, option, run))
         found = merged({run.run: self._found_in(estimates, r)}, self.study.name)
-        if r.truth is None or self.options.truth is not None:
+        if r.sources.truth is None or self.options.sources.truth is not None:
             return found
-        note = f"{r.truth}: taken as the truth of the run, as no column of {estimates.name} is one; see --truth"
+        note = f"{r.sources.truth}: taken as the truth of the run, as no column of {estimates.name} is one; see --truth"
         return [replace(one, notes=(*one.notes, note)) for one in found]
 
     @property
@@ -372,7 +373,7 @@ def log_lines(path: Path, lines: int) -> list[str]:
 
 def _needs_truth(path: Path, r: Reading) -> bool:
     """Whether no column of a text file of estimates is a truth, an innovation or a NIS."""
-    head = head_of(path, r.columns) if path.suffix.lower() in (".csv", *TRAJECTORIES) else None
+    head = head_of(path, r.components.columns) if path.suffix.lower() in (".csv", *TRAJECTORIES) else None
     names = [] if head is None else head.names
     return not (has_nis(names) or any(stem_of(name, TRUE) for name in names))
 
@@ -445,8 +446,8 @@ def read_table_of_run(file: Path, r: Reading, poses_alone: bool = False) -> list
     InputError
         It has no truth; as :func:`read_tables`.
     """
-    if r.truth is not None:
-        r = replace(r, truth=paired(r.truth, file, "--truth", "table '{}'"))
+    if r.sources.truth is not None:
+        r = r.with_truth(paired(r.sources.truth, file, "--truth", "table '{}'"))
     return read_tables(file, r, poses_alone)
 
 

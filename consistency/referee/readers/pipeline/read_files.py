@@ -117,8 +117,8 @@ def _table_folder(path: Path, r: Reading, poses_alone: bool) -> Found:
 
 
 def _is_table_folder(path: Path, r: Reading) -> bool:
-    named = r.state is not None or r.level is not None
-    return path.is_dir() and bool(table_files(path)) and (named or not trajectory_files(path, r.columns))
+    named = r.components.state is not None or r.statement.level is not None
+    return path.is_dir() and bool(table_files(path)) and (named or not trajectory_files(path, r.components.columns))
 
 
 def _is_archive(path: Path, r: Reading) -> bool:
@@ -126,10 +126,10 @@ def _is_archive(path: Path, r: Reading) -> bool:
 
 
 def _is_table(path: Path, r: Reading) -> bool:
-    named = r.state is not None or r.level is not None
-    if path.suffix.lower() in TABLES and (named or not is_spatial(path, r.columns)):
+    named = r.components.state is not None or r.statement.level is not None
+    if path.suffix.lower() in TABLES and (named or not is_spatial(path, r.components.columns)):
         return True
-    return is_plane(path, r.columns)
+    return is_plane(path, r.components.columns)
 
 
 def _is_trajectory(path: Path, r: Reading) -> bool:
@@ -160,19 +160,19 @@ def found_in(estimates: Path, r: Reading) -> Found:
     if not estimates.exists():
         raise InputError(f"{estimates}: no such file")
     require_name(estimates.name, "file")
-    if r.body is not None and not (r.truth is not None and is_drive(r.truth)):
-        raise InputError(f"--body {r.body}: goes with --truth DIR, the folder of a KITTI drive")
+    if r.sources.body is not None and not (r.sources.truth is not None and is_drive(r.sources.truth)):
+        raise InputError(f"--body {r.sources.body}: goes with --truth DIR, the folder of a KITTI drive")
     kind = kind_of(estimates, r)
     of_truth = r
-    if r.repeats:
-        of_truth = replace(r, truth=None)
+    if r.sources.repeats:
+        of_truth = r.with_truth(None)
         if kind is not None and kind.read not in (_archive, _tables):
             raise InputError(f"--truth repeats: is for tables and archives of runs of the same values, not {estimates}")
     refuse_options(estimates, of_truth, *(OF_BAGS if kind is None else kind.refused))
     if kind is None:
         raise unknown_kind(estimates)
-    if r.truth is not None and is_foreign(r.truth):
-        raise unknown_kind(r.truth)
+    if r.sources.truth is not None and is_foreign(r.sources.truth):
+        raise unknown_kind(r.sources.truth)
     return kind.read(estimates, r, False)
 
 
@@ -235,7 +235,7 @@ def read_frames(estimates: Any, truth: Any, reading: Reading) -> list[Record]:
 
     sheet = rows(estimates, "estimates")
     true = rows(truth, "truth")
-    r = checked_options(replace(reading, truth=cast(Any, true)))
+    r = checked_options(reading.with_truth(cast(Any, true)))
     refuse_options(Path("tables in memory"), r, *OF_TRAJECTORIES, *OF_BAGS)
     return _read("tables", r, lambda options: _records(read_tables(sheet, options), options))
 
@@ -264,9 +264,9 @@ def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> lis
     """Records under the declared convention, or under each, with what else is declared of them."""
 
     def under(convention: str | None) -> list[Record]:
-        return _declared(read(replace(r, error=convention)), r)
+        return _declared(read(r.with_error(convention)), r)
 
-    return _guessed(name, r, under) if r.error == GUESS else under(r.error)
+    return _guessed(name, r, under) if r.conventions.error == GUESS else under(r.conventions.error)
 
 
 def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) -> list[Record]:
@@ -295,14 +295,14 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
         from consistency.referee.readers.truth_covariance import declared
 
         records = declared(records, r)
-    if r.repeats or r.ensemble is not None:
+    if r.sources.repeats or r.statement.ensemble is not None:
         from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
 
-        if r.repeats:
+        if r.sources.repeats:
             records = [of_repeats(record) for record in records]
-        if r.ensemble is not None:
-            records = [of_ensemble(record, r.ensemble) for record in records]
-    if r.independent and r.relative is None:
+        if r.statement.ensemble is not None:
+            records = [of_ensemble(record, r.statement.ensemble) for record in records]
+    if r.runs.independent and r.runs.relative is None:
         from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
 
         return [rows_as_runs(record) for record in records]
@@ -325,12 +325,12 @@ def _records(found: Found, r: Reading) -> list[Record]:
     for one in found:
         if isinstance(one, Estimator):
             records += _records_of_runs(one, r)
-        elif r.by is None:
+        elif r.groups.by is None:
             records.append(one)
         else:
             from consistency.referee.readers.pipeline.by_column import record_in_groups
 
-            records.append(record_in_groups(one, r))
+            records.append(record_in_groups(one, r.groups))
     return records
 
 
@@ -351,17 +351,18 @@ def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
 
 def own_names(record: Record, r: Reading) -> dict[str, str]:
     """What ``--columns`` calls components whose errors are differences of columns; none of others, as in the body."""
-    if record.errors.convention not in IN_COLUMNS or record.origin.window is not None or r.align is not None:
+    if record.errors.convention not in IN_COLUMNS or record.origin.window is not None or r.matching.align is not None:
         return {}
-    return columns_of_axes(record.errors.axes, r.columns)
+    return columns_of_axes(record.errors.axes, r.components.columns)
 
 
 def _by_kind(estimates: Path, r: Reading) -> list[Record]:
     records = _records(found_in(estimates, r), r)
-    notes = [fitted_note(path) for path in (r.covariance, estimates) if path is not None]
-    if r.truth is not None and is_drive(r.truth):
-        of = f"the truth is the path of the {r.body or 'imu'} as its first pose sees it, t in s from the first packet"
-        notes.insert(0, f"{r.truth}: {of}")
+    notes = [fitted_note(path) for path in (r.sources.covariance, estimates) if path is not None]
+    if r.sources.truth is not None and is_drive(r.sources.truth):
+        body = r.sources.body or "imu"
+        of = f"the truth is the path of the {body} as its first pose sees it, t in s from the first packet"
+        notes.insert(0, f"{r.sources.truth}: {of}")
     if any(notes):
         origin = records[0].origin
         records[0] = replace(records[0], origin=replace(origin, notes=(*filter(None, notes), *origin.notes)))
@@ -376,63 +377,68 @@ def pieces_asked(r: Reading) -> int | None:
     InputError
         It is not a number of pieces, or another option makes runs of the log.
     """
-    if r.split is None:
+    split = r.runs.split
+    if split is None:
         return None
     others = dict.fromkeys(OF_WINDOWS, ", which cuts the log into windows")
     r.refuse("--split", others | {"independent": ", with which each row is a run already"})
-    if r.align not in (None, "none"):
-        raise InputError(f"--split: does not go with --align {r.align}: all pieces would share the error of one frame")
-    if r.split == "auto":
+    align = r.matching.align
+    if align not in (None, "none"):
+        raise InputError(f"--split: does not go with --align {align}: all pieces would share the error of one frame")
+    if split == "auto":
         return 0
-    if not str(r.split).isdecimal() or int(r.split) < 1:
-        raise InputError(f"--split {r.split}: must be a number of pieces, or 'auto'")
-    return int(r.split)
+    if not str(split).isdecimal() or int(split) < 1:
+        raise InputError(f"--split {split}: must be a number of pieces, or 'auto'")
+    return int(split)
 
 
 def checked_options(r: Reading) -> Reading:
     """Options that go together, whatever the file; numbers are floats, and no alignment is None."""
     windows_asked(r)
-    if r.error not in (None, GUESS, *CONVENTIONS):
-        raise InputError(f"--error {r.error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
-    if r.max_dt is not None and not (math.isfinite(r.max_dt) and r.max_dt >= 0):
-        raise InputError(f"--max-dt {r.max_dt:g}: must be 0 or more, in s")
-    arm = r.lever_arm
+    error = r.conventions.error
+    if error not in (None, GUESS, *CONVENTIONS):
+        raise InputError(f"--error {error}: must be one of {', '.join((*CONVENTIONS, GUESS))}")
+    matching = r.matching
+    if matching.max_dt is not None and not (math.isfinite(matching.max_dt) and matching.max_dt >= 0):
+        raise InputError(f"--max-dt {matching.max_dt:g}: must be 0 or more, in s")
+    arm = matching.lever_arm
     if arm is not None and not (len(arm) == 3 and all(map(math.isfinite, arm))):
         raise InputError("--lever-arm: must be three numbers x,y,z, in m")
-    offset = r.time_offset
+    offset = matching.time_offset
     if isinstance(offset, int):
         offset = float(offset)
     if offset not in (None, "estimate") and not (isinstance(offset, float) and math.isfinite(offset)):
         raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
-    if offset is not None and r.truth is None and r.truth_topic is None:
+    has_truth = bool(r.given(("truth", "truth_topic")))
+    if offset is not None and not has_truth:
         raise InputError("--time-offset needs --truth: without truth there are no clocks to compare")
-    if r.relative is not None and offset == "estimate":
+    if r.runs.relative is not None and offset == "estimate":
         raise InputError("--time-offset estimate: needs poses in one world; with --relative give seconds")
     if r.given(OF_TRUTH):
         from consistency.referee.readers.truth_covariance import require_truth_options
 
         require_truth_options(r)
-    if r.repeats:
+    if r.sources.repeats:
         why = ": repeats have no truth, and each run is compared with those before"
         of_truth = (*OF_WINDOWS, *OF_TRUTH, *GROUPED, "align", "split", "time_offset")
         r.refuse("--truth repeats", dict.fromkeys(of_truth, why))
-    if r.ensemble is not None and r.given(OF_TRUTH):
+    if r.statement.ensemble is not None and r.given(OF_TRUTH):
         raise InputError(f"--ensemble: does not go with {flag_of(r.given(OF_TRUTH)[0])}, of a Gaussian error")
     if r.given(OF_BOUNDS):
         from consistency.referee.readers.formats.bounds import require_bound_options
 
         require_bound_options(r)
     for name in ("by_file", "bins"):
-        if r.given([name]) and r.by is None:
+        if r.given([name]) and r.groups.by is None:
             raise InputError(f"{flag_of(name)}: goes with --by COLUMN")
-    if r.align not in (None, *ALIGNMENTS):
-        raise InputError(f"--align {r.align}: must be one of {', '.join(ALIGNMENTS)}")
-    align = None if r.align == "none" else r.align
-    if align is not None and (r.truth or r.truth_topic) is None:
+    if matching.align not in (None, *ALIGNMENTS):
+        raise InputError(f"--align {matching.align}: must be one of {', '.join(ALIGNMENTS)}")
+    align = None if matching.align == "none" else matching.align
+    if align is not None and not has_truth:
         raise InputError(f"--align {align} needs --truth, with which the estimates are aligned")
-    if r.relative is not None and align is not None:
+    if r.runs.relative is not None and align is not None:
         raise InputError(f"--align {align}: does not go with --relative, which needs no common world; leave it out")
     pieces_asked(r)  # refused before anything is read
-    if r.independent and align is not None:
+    if r.runs.independent and align is not None:
         raise InputError(f"--independent: does not go with --align {align}: all rows would share the error of a frame")
-    return replace(r, time_offset=offset, align=align)
+    return replace(r, matching=replace(matching, time_offset=offset, align=align))

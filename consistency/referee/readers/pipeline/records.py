@@ -58,22 +58,22 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     InputError
         A run has no estimate with truth and covariance, or the covariance is singular throughout.
     """
-    if e.innovations_alone and r.by is None:
-        return [_innovations(e, bool(r.independent))]
-    if r.unstated:
+    if e.innovations_alone and r.groups.by is None:
+        return [_innovations(e, bool(r.runs.independent))]
+    if r.statement.unstated:
         e = with_unit_covariances(e)
     require_radians(str(e.path), e.runs)
     judged = _judged(e, r)
-    if r.ensemble is not None:
-        e = _without_cross_terms(e, judged, r.ensemble)
-    if r.by is None:
+    if r.statement.ensemble is not None:
+        e = _without_cross_terms(e, judged, r.statement.ensemble)
+    if r.groups.by is None:
         records, _ = _records(e, judged, r)
         return _with_bounds(records, e, r)
     from consistency.referee.readers.pipeline.by_column import in_groups, with_values
 
-    e, column = with_values(e, r, judged)
+    e, column = with_values(e, r.groups, judged)
     records, pairs = _records(e, judged, r)
-    return _with_bounds(in_groups(records, column, e, pairs, r), e, r)
+    return _with_bounds(in_groups(records, column, e, pairs, r.groups), e, r)
 
 
 def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record]:
@@ -82,7 +82,7 @@ def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record
         return records
     from consistency.referee.readers.formats.bounds import judged_bounds
 
-    return [judged_bounds(record, e, str(r.level)) for record in records]
+    return [judged_bounds(record, e, str(r.statement.level)) for record in records]
 
 
 def with_unit_covariances(e: Estimator) -> Estimator:
@@ -116,17 +116,17 @@ def windows_asked(r: Reading) -> Relative | None:
         return None
     from consistency.referee.readers.runs_to_record import relative_of
 
-    windows = INDEPENDENT if r.independent and r.relative is not None else r.windows
-    return relative_of(r.relative, bool(r.motions), windows)
+    windows = INDEPENDENT if r.runs.independent and r.runs.relative is not None else r.runs.windows
+    return relative_of(r.runs.relative, bool(r.runs.motions), windows)
 
 
 def _judged(e: Estimator, r: Reading) -> list[int]:
     """Components of the error that are judged: those of ``--axes``, or all that are stated."""
-    if r.axes is not None:
-        if unknown := set(r.axes).difference(e.axes):
-            first = next(axis for axis in r.axes if axis in unknown)
-            raise InputError(f"--axes {','.join(r.axes)}: '{first}' is not one of {', '.join(e.axes)}")
-        judged = [i for i, axis in enumerate(e.axes) if axis in r.axes]
+    if r.components.axes is not None:
+        if unknown := set(r.components.axes).difference(e.axes):
+            first = next(axis for axis in r.components.axes if axis in unknown)
+            raise InputError(f"--axes {','.join(r.components.axes)}: '{first}' is not one of {', '.join(e.axes)}")
+        judged = [i for i, axis in enumerate(e.axes) if axis in r.components.axes]
     elif e.judged is not None:
         judged = list(e.judged)
     else:
@@ -142,21 +142,21 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     runs = e.runs
     shift = 0.0
     level: list[str] = []
-    if e.in_space and r.axes is None:
+    if e.in_space and r.components.axes is None:
         judged, level = level_components(e, judged)
     of_clocks: list[str] = []
     fit = TruthFit()
-    if r.align is not None:
+    if r.matching.align is not None:
         from consistency.referee.readers.alignment import clocks_and_frames
 
-        shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.time_offset, r.align, judged)
+        shift, of_clocks, moved = clocks_and_frames(e.said, runs, r.matching.time_offset, r.matching.align, judged)
         runs = moved.runs
         fit = moved.fit
         of_clocks += moved.notes
     elif not runs[0].numbered:
         from consistency.referee.readers.clocks import clock_shift
 
-        shift, of_clocks = clock_shift(e.said, runs, r.time_offset, judged)
+        shift, of_clocks = clock_shift(e.said, runs, r.matching.time_offset, judged)
     pairs = [_paired(e, p, r, shift) for p in runs]
     notes = [*e.notes, *_left_out(e, runs, pairs)]
     if _start_is_exact(e, runs):
@@ -168,12 +168,12 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     errors = [p.errors() for p in pairs]
     if e.in_space:
         notes += _space_notes(e, pairs, errors)
-        if r.axes is None:
+        if r.components.axes is None:
             judged, still = estimated_components(e, errors, judged)
             notes += [*level, *still]
     causes = [*e.causes]
     are_covariances = e.bounds is None or e.bounds.gaussian
-    if are_covariances and r.ensemble is None and runs[0].members is None and not r.repeats:
+    if are_covariances and r.statement.ensemble is None and runs[0].members is None and not r.sources.repeats:
         causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
     if e.convention:
@@ -189,7 +189,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
             continue
         some = [track.part(part) for track in tracks]
         axes = tuple(e.axes[i] for i in part)
-        file, rows = str(e.covariances or e.path), bool(r.independent)
+        file, rows = str(e.covariances or e.path), bool(r.runs.independent)
         record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
         record = replace(
             record,
@@ -244,7 +244,7 @@ def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
         true_t = found.true_clock
         where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
         refuse(
-            np.abs(t - true_t) > r.tolerance + ROUNDING,
+            np.abs(t - true_t) > r.matching.tolerance + ROUNDING,
             found.place.__getitem__,
             lambda row: f"t is {exact(t[row])}, but {exact(true_t[row])} {where}",
         )
@@ -456,7 +456,7 @@ def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative
             refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
         elif p.cross is not None and not p.stated.all():
             p = p.of_rows(np.flatnonzero(p.stated))
-        p = p.later(r.shift)
+        p = p.later(r.matching.shift)
         if not len(p.known().rows):
             raise _nothing_known(e, p, 0.0)
         runs.append(p)

@@ -665,7 +665,7 @@ def simultaneous_band(
 
 
 def _rounded_to_zero(nees: Array) -> Array:
-    """What the zeros of each step of (runs, steps) add up to, each taken as the smallest NEES that is not 0, (steps,)."""
+    """Sum of the zeros of each step of (runs, steps), each taken as the smallest NEES that is not 0, (steps,)."""
     with np.errstate(invalid="ignore"):
         smallest = float(np.min(nees, initial=np.inf, where=nees > ZERO))
         zeros = (nees <= ZERO).sum(axis=0)

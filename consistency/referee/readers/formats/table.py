@@ -335,6 +335,9 @@ def _estimator(
         if not len(one.true_t):
             has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
+    if convention == "vector" and r.conventions.error is None and r.components.members is None:
+        of_runs, on_one_turn = columns.without_turns(of_runs, axes)
+        notes += filter(None, [on_one_turn])
     definition = PLANAR[convention]
     judged = None if bounds is None else sorted(set(sum(bounds.places, ())))
     found = Estimator(

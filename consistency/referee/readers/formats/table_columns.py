@@ -10,9 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import OWN_COVARIANCE, POSE
+from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.clocks import unit_of
 from consistency.referee.readers.formats.columns import (
+    HEADINGS,
     OWN,
     QUATERNIONS,
     TRUE,
@@ -35,9 +37,12 @@ from consistency.referee.readers.formats.text_blocks import FileRows, blocks
 from consistency.referee.readers.options import GroupOptions
 from consistency.referee.readers.places import exact, listed, refuse
 from consistency.referee.readers.runs_to_record import symmetric
+from consistency.referee.readers.truth_matching import Poses
 from consistency.referee.types import Array, Indices
 
 KEYS = ("run", "step", "t")
+ANGLES = {*HEADINGS, "roll", "pitch", "phi", "course", "azimuth", "bearing"}  # words in names of components
+LEAST_APART = 0.75  # of a turn: less may be an error
 
 # --- names -------------------------------------------------------------------------------------------
 
@@ -256,6 +261,40 @@ def by_run(sheet: TableRows, key: str) -> tuple[TableRows, Array]:
         runs = sheet.numbers("run", whole=True).astype(int)
     order = row_order(sheet, runs, key)
     return sheet.rows(order), runs[order]
+
+
+# --- angles ------------------------------------------------------------------------------------------
+
+
+def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Poses], str]:
+    """Vectors whose angles do not jump by a whole turn, nor differ by one from the truth, and a note where they did.
+
+    A component is an angle by its name: ``yaw``, ``roll_deg``, ``att_pitch``. It is in radians if no value exceeds a
+    turn of these, and in degrees otherwise; values beyond 360 are taken to count turns and stay.
+    """
+    angles = [i for i, axis in enumerate(axes) if ANGLES & set(axis.lower().split("_"))]
+    found = [replace(p, estimate=p.estimate.copy(), truth=p.truth.copy()) for p in runs] if angles else list(runs)
+    changed = []
+    for i in angles:
+        size = max(np.nanmax(np.abs(values[:, i]), initial=0.0) for p in runs for values in (p.estimate, p.truth))
+        turn = 2.0 * np.pi if size <= 2.0 * np.pi + 1e-6 else 360.0
+        rows = 0
+        for p in found if size <= 360.0 else ():
+            rows += int((np.abs(_apart(p, i)) > LEAST_APART * turn).sum())
+            p.truth[:, i] = np.unwrap(p.truth[:, i], period=turn)
+            apart = _apart(p, i)
+            p.estimate[:, i] += turn * np.where(np.abs(apart) > LEAST_APART * turn, np.round(apart / turn), 0.0)
+        if rows:
+            changed.append(f"{axes[i]} ({plural(rows, 'row')})")
+    if not changed:
+        return found, ""
+    what = f"angles that differ from the truth by a whole turn are turned back: {', '.join(changed)}"
+    return found, f"{what}; --error vector leaves them"
+
+
+def _apart(p: Poses, i: int) -> Array:
+    """Truth less estimate of one component, (N,), the truth interpolated."""
+    return np.asarray(np.interp(p.t, p.true_t, p.truth[:, i]) - p.estimate[:, i])
 
 
 # --- covariances and innovations ------------------------------------------------------------------------

@@ -64,10 +64,7 @@ def _sentence(monitor: Monitor, alarm: Alarm | None, t: float, since_t: float, s
     if alarm is None:
         sentence = f"no alarm: no evidence that the NIS is off ({accepted_scales(monitor.tolerance)}). {CAVEAT}."
         if monitor.tolerance > 1.0:
-            sentence += (
-                " 'consistency analyse --innovations optimal' tests whether it is right exactly, and so may find what "
-                "is accepted here; --tolerance 1 asks the same here."
-            )
+            sentence += " --tolerance 1 asks whether it is right exactly, and so may find what is accepted here."
     else:
         sentence = str(alarm)
         if np.isfinite(t):

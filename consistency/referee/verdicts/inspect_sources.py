@@ -24,11 +24,20 @@ from consistency.referee.diagnostics.words.numbers import percent, plural, short
 from consistency.referee.document.blocks import Block, Bullets, Document, Facts, Text, fragment
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import file_kinds, flight_logs
-from consistency.referee.readers.formats.columns import CLOCKS, OWN, TRUE, covariance_columns, state_columns, stem_of
+from consistency.referee.readers.formats.columns import (
+    CLOCKS,
+    OWN,
+    TRUE,
+    covariance_columns,
+    run_column,
+    state_columns,
+    stem_of,
+)
 from consistency.referee.readers.formats.innovation_files import SeveralError
 from consistency.referee.readers.options import OPTIONS, Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline import read_files
 from consistency.referee.readers.places import listed
+from consistency.referee.readers.runs_to_record import not_estimated
 from consistency.referee.readers.truth_matching import WHOLE, Estimator, submatrices
 from consistency.referee.types import Array
 from consistency.referee.verdicts.compare_sources import is_baseline
@@ -140,7 +149,8 @@ def inspect(path: Path, r: Reading | None = None) -> Inspection:
     if kind is None:
         raise file_kinds.unknown_kind(path)
     contents = _contents(path, r)
-    tried = _advised(path, _search(path, r, {}, DEEPEST))
+    tried = _with_runs(path, r) or _search(path, r, {}, DEEPEST)
+    tried = _advised(path, _without_idle(path, tried))
     facts = (*contents, *tried.facts)
     if tried.refusal:
         return _refused(path, kind, facts, tried)
@@ -177,6 +187,29 @@ def _attempt(path: Path, r: Reading, why: Mapping[str, str]) -> Attempt:
         return Attempt(r, why, found, read_files.records_of_found(found, checked))
     except InputError as error:
         return Attempt(r, why, found, refusal=str(error))
+
+
+def _with_runs(path: Path, r: Reading) -> Attempt | None:
+    """With a column of another name as the run, as far as such a table is not refused."""
+    name = run_column(_names(path, r))
+    if name is None:
+        return None
+    with_run = r.with_options(columns={"run": name, **(r.components.columns or {})})
+    tried = _search(path, with_run, {"columns": f"'{name}' numbers the runs, by its name"}, DEEPEST)
+    return None if tried.refusal else tried
+
+
+def _without_idle(path: Path, tried: Attempt) -> Attempt:
+    """Without components of a state that was found whose errors are 0 in every row: nobody estimates them."""
+    estimators = [each for each in tried.found if isinstance(each, Estimator)]
+    if tried.refusal or "state" not in tried.why or not estimators:
+        return tried
+    idle = np.all([not_estimated([p.errors() for p in e.runs], [p.variances for p in e.runs]) for e in estimators], 0)
+    if not idle.any():
+        return tried
+    axes = np.array(estimators[0].axes)
+    reason = f"{tried.why['state']}; without {', '.join(axes[idle])}, whose errors are 0 in every row"
+    return _attempt(path, tried.reading.with_options(state=axes[~idle].tolist()), {**tried.why, "state": reason})
 
 
 def _search(path: Path, r: Reading, why: Mapping[str, str], depth: int) -> Attempt:
@@ -249,7 +282,8 @@ def _state(path: Path, r: Reading) -> list[str]:
         true |= {*_names(r.sources.truth, make_reading(columns=r.components.truth_columns))}
     state = [name for name in names if name in true and name.lower() not in COUNTED]
     stated = [axis for axis in state if covariance_columns(names, [axis]).in_order(1)]
-    if len(state_columns(names, POSE, OWN)) == len(POSE) or not stated:
+    is_pose = len(state_columns(names, POSE, OWN)) == len(POSE) and covariance_columns(names, POSE).places
+    if is_pose or not stated:
         return []
     return stated if covariance_columns(names, stated).in_order(len(stated)) else []
 
@@ -320,7 +354,10 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
     if not tried.found and r.sources.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts
         own = _attempt(path, r.with_truth(path), {}).facts
         facts = (*facts, *(fact for fact in own if fact[0] != "truth"))
-    return Inspection(path, kind.name, facts, notes, tuple(why), missing=tried.refusal)
+    missing = tried.refusal
+    if "--truth FILE" in missing and not notes:
+        missing += f"; what to run then says: {_command('inspect', path, r, ('--truth', 'FILE'))}"
+    return Inspection(path, kind.name, facts, notes, tuple(why), missing=missing)
 
 
 def _innovations(path: Path, r: Reading, kind: str, facts: Pairs = (), choice: Mapping[str, Any] = {}) -> Inspection:

@@ -373,5 +373,5 @@ def test_the_plot_is_over_time_where_there_is_one():
 
 def test_no_alarm_says_what_analyse_asks():
     quiet = str(document_of(changed(1.0)).opening)
-    assert "'consistency analyse --innovations optimal' tests whether it is right exactly" in quiet
+    assert "--tolerance 1 asks whether it is right exactly" in quiet
     assert "analyse" not in str(document_of(changed(1.0, tolerance=1.0)).opening)

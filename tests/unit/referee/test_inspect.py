@@ -420,3 +420,59 @@ class TestBags:
         assert "--by turn_rate says where" in out
         assert "2 runs of 150 rows" in out
         assert "verdict" in judged
+
+
+# --- a state of one's own ------------------------------------------------------------------------------
+
+
+def navigation(folder, rng, run="drive", restarts=False):
+    """A table of four drives with variances, components that nobody estimates, and its truth beside it."""
+    names = ["px", "py", "yaw", "roll", "pitch"]
+    est = [",".join([run, "time", *names, *(f"var_{name}" for name in names)])]
+    true = [",".join([run, "time", *names])]
+    for drive in range(4):
+        for k in range(12):
+            t = 0.5 * k + (0.0 if restarts else 1000.0 * drive)
+            state = np.array([k, 2.0 * k, 0.1 * k, 0.0, 0.0])
+            error = np.append(0.1 * rng.standard_normal(3), [0.0, 0.0])
+            true.append(",".join(map(str, [drive, t, *state.tolist()])))
+            est.append(",".join(map(str, [drive, t, *(state - error).tolist(), 0.01, 0.01, 0.01, 1e-9, 1e-9])))
+    (folder / "nav.csv").write_text("\n".join(est), encoding="utf-8")
+    (folder / "reference.csv").write_text("\n".join(true), encoding="utf-8")
+    return folder / "nav.csv"
+
+
+@pytest.mark.parametrize("run", ["drive", "Trial", "run_id"])
+@pytest.mark.parametrize("restarts", [True, False])
+def test_runs_and_variances_of_other_names_are_found(run, restarts, rng, tmp_path):
+    path = navigation(tmp_path, rng, run, restarts)
+    found = cs.inspect(path)
+    truth = tmp_path / "reference.csv"
+    expected = f"consistency analyse {path} --truth {truth} --state px,py,yaw --columns run={run}"
+    assert found.command == expected
+    why = dict(found.options)
+    assert f"'{run}' numbers the runs" in why["--columns"]
+    assert "without roll, pitch, whose errors are 0 in every row" in why["--state"]
+    assert len(cs.read(path, **found.arguments).run_numbers) == 4
+
+
+def test_a_run_of_another_name_is_named_where_times_restart(rng, tmp_path):
+    path = navigation(tmp_path, rng, restarts=True)
+    with pytest.raises(cs.InputError, match=r"line 14: t 0 .* 'run'; 'drive' may be it"):
+        cs.read(path, truth=tmp_path / "reference.csv", state=["px", "py", "yaw"])
+
+
+def test_a_text_does_not_number_runs(rng, tmp_path):
+    path = navigation(tmp_path, rng)
+    for file in (path, tmp_path / "reference.csv"):
+        head, *rows = file.read_text(encoding="utf-8").splitlines()
+        file.write_text("\n".join([head, *(f"d{row}" for row in rows)]), encoding="utf-8")
+    assert "--columns" not in cs.inspect(path).command
+
+
+def test_without_a_truth_the_command_that_says_more_is_named(rng, tmp_path):
+    path = navigation(tmp_path, rng)
+    (tmp_path / "reference.csv").unlink()
+    found = cs.inspect(path)
+    assert not found.command
+    assert f"consistency inspect {path} --truth FILE" in found.missing

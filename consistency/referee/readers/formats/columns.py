@@ -30,6 +30,7 @@ FAMILIES = (POSITIONS, QUATERNIONS, *MOVING)
 INNER = ("position_{}", "translation_{}", "orientation_{}", "rotation_{}")  # which a longer name may end in
 HEADINGS = ("heading", "theta", "yaw", "orientation", "psi")
 SHORT_HEADINGS = ("h", "th", "t")  # in names of a covariance alone
+RUNS = ("run_id", "drive", "trial", "seq", "sequence", "episode", "flight", "session", "realization", "mc")
 PLANE = (("x", "tx", "px"), ("y", "ty", "py"), HEADINGS)  # of a pose in the plane
 SPEEDS = ("v", "speed", "velocity", "forward_velocity", "linear_velocity", "linear_x", "vx", "v_x")
 TURNS = ("omega", "w", "yaw_rate", "yawrate", "turn_rate", "angular_velocity", "angular_z", "wz", "w_z")
@@ -63,6 +64,12 @@ Columns = Mapping[str, str]  # names of columns here, and those in a file
 def is_pose(axes: Sequence[str]) -> bool:
     """Whether a state is a pose in the plane: x, y, heading."""
     return list(axes) == POSE
+
+
+def run_column(names: Sequence[str]) -> str | None:
+    """The column that numbers the runs by its name; None where there is none, or a column ``run``."""
+    plain = plain_names(names)
+    return None if "run" in plain else next((names[plain.index(word)] for word in RUNS if word in plain), None)
 
 
 def state_columns(names: Sequence[str], axes: Sequence[str], spellings: Sequence[str]) -> dict[str, int]:

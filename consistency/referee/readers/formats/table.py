@@ -88,6 +88,9 @@ def _both(
         sheet, truth = beside_first_run(sheet, axes)
     elif r.sources.truth is not None:
         truth, read_as = _sheet(r.sources.truth, axes, r.components.truth_columns, body=r.sources.body)
+        run = (r.components.columns or {}).get("run")
+        if run in truth and "run" not in truth:  # of the same name in both
+            truth = truth.renamed({"run": run})
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     if r.statement.level is not None:
         from consistency.referee.readers.formats.bounds import with_centres
@@ -335,10 +338,11 @@ def _estimator(
         if not len(one.true_t):
             has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
+    definition = PLANAR[convention]
     if convention == "vector" and r.conventions.error is None and r.components.members is None:
         of_runs, on_one_turn = columns.without_turns(of_runs, axes)
-        notes += filter(None, [on_one_turn])
-    definition = PLANAR[convention]
+        if on_one_turn:
+            definition = f"plain difference; {on_one_turn}"
     judged = None if bounds is None else sorted(set(sum(bounds.places, ())))
     found = Estimator(
         name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,

@@ -28,6 +28,7 @@ from consistency.referee.readers.formats.columns import (
     naming,
     places_of,
     require_units,
+    run_column,
     state_columns,
     stem_of,
 )
@@ -243,6 +244,8 @@ def row_order(sheet: TableRows, runs: Array, key: str) -> Indices:
     before, row = order[stuck[0] : stuck[0] + 2]
     of = ""
     hint = "; several runs need a column 'run'"
+    if named := run_column(list(sheet.data)):
+        hint += f"; '{named}' may be it: --columns run={named}"
     if "run" in sheet:
         of = f" of run {runs[row]}"
         hint = ""

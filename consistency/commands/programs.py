@@ -72,7 +72,9 @@ def monte_carlo_command(
     ] = None,
     junit: Annotated[Path | None, typer.Option("--junit", help="JUnit file of the verdict, for CI.")] = None,
     as_json: AsJson = False,
-    fail_on: Annotated[str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 if any filter is.")] = None,
+    fail_on: Annotated[
+        str | None, typer.Option("--fail-on", help="'inconsistent': exit 1 unless all are consistent.")
+    ] = None,
 ) -> None:
     """Run any program many times, and judge its estimates. Each run has another {seed}.
 

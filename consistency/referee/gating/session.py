@@ -208,8 +208,8 @@ def undecided_text(
     if terms.lost is not None:
         larger += " and a larger lost"
     return (
-        f"{gate}: {name} is {sentence}. Simulate {needed} runs, or ask for {larger}; the number that is enough "
-        f"however the steps depend on each other: {plan_invocation(dof, terms, level)}"
+        f"{gate}: {name} is {sentence}. Simulate {needed} runs, which are enough however the steps depend "
+        f"on each other ({plan_invocation(dof, terms, level)}), or ask for {larger}"
     )
 
 

@@ -11,6 +11,7 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict
 from consistency.referee.errors import InputError, naming_arguments
+from consistency.referee.extras import explained_import
 from consistency.referee.notebook.read_and_judge import read
 from consistency.referee.verdicts import compare_sources, judge_sources
 
@@ -121,8 +122,14 @@ def verdict_table(verdicts: Mapping[str, Verdict] | Iterable[Verdict]) -> pd.Dat
     pandas.DataFrame
         ``verdict``, ``runs``, ``steps``, ``anees`` and its expected value, ``ratio`` of true to stated covariance with
         the ends of its interval, ``worst_axis``, ``failed`` runs and ``faults``; NaN without a truth
+
+    Raises
+    ------
+    MissingPackageError
+        There is no pandas.
     """
-    import pandas as pd
+    with explained_import("verdict_table"):
+        import pandas as pd
 
     named = verdicts if isinstance(verdicts, Mapping) else [(verdict.filter, verdict) for verdict in verdicts]
     rows = {}

@@ -378,6 +378,9 @@ def write_verdict(verdict: Verdict, path: str | Path, overwrite: bool) -> list[P
     if is_one_file(path):
         return [write_text_file(shown, path)]
     if verdict.record is None:
-        raise InputError(f"{verdict.filter}: the record was not kept with the verdict; write FILE.xml or FILE.md")
+        raise InputError(
+            f"{verdict.filter}: the record was not kept with the verdict; write FILE.xml or FILE.md, or "
+            "judge the arrays of the gate by consistency.judge, whose verdict writes a page"
+        )
     judged = {verdict.filter: verdict}
     return write_file_reports([verdict.record], judged, path, verdict.filter, render(document(judged)), replaces)

@@ -118,9 +118,15 @@ def require_report(report: Path, overwrite: bool) -> bool:
     Raises
     ------
     InputError
-        Something other than a report of a verdict is there, without ``overwrite``; or the system refuses.
+        Something other than a report of a verdict is there, without ``overwrite``; the name is of a page or of JSON,
+        which a folder has; or the system refuses.
     """
     from consistency.referee.system.folders import require_free
+
+    if report.suffix.lower() in (".html", ".pdf", ".json") and not report.is_dir():
+        raise InputError(
+            f"{report}: a report is a folder, which has the page, the PDF and the JSON, or FILE.xml, FILE.md"
+        )
 
     replaces = overwrite or is_own_report(report)
     if is_one_file(report):

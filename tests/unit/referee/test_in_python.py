@@ -1,6 +1,7 @@
 """What commands do, from Python: runs to plan, estimators to compare, verdicts to write and list; names in errors."""
 
 import json
+import sys
 
 import numpy as np
 import pandas as pd
@@ -147,3 +148,18 @@ def test_no_error_of_a_public_function_names_a_flag(tmp_path):
         with pytest.raises(InputError) as caught:
             call()
         assert "--" not in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize("name", ["look.html", "look.pdf", "look.JSON"])
+def test_a_page_by_itself_is_refused(name, rng, tmp_path):
+    verdict = cs.judge(rng.standard_normal((30, 5, 2)), np.broadcast_to(np.eye(2), (30, 5, 2, 2)))
+    with pytest.raises(cs.InputError, match=f"{name}: .* folder.* FILE.xml"):
+        verdict.write(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_of_verdicts_says_that_it_needs_pandas(rng, monkeypatch):
+    verdict = cs.judge(rng.standard_normal((30, 5, 2)), np.broadcast_to(np.eye(2), (30, 5, 2, 2)))
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pandas"):
+        cs.verdict_table([verdict])

@@ -65,6 +65,9 @@ def messages(store, kind, drive, ros1):
         else:
             name = "geometry_msgs/msg/PoseWithCovarianceStamped"
             yield "/pose", name, late(t), T[name](header(t, "map"), content)
+    for t in getattr(drive, "fixes", ()):  # of which the stamps alone are read
+        name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        yield "/amcl_pose", name, late(t), T[name](header(t, "map"), stated(pose(drive.own[0]), drive.P.ravel()))
     for t, values in zip(drive.true_t, drive.true, strict=True):
         if kind == "odometry":
             turn = T["geometry_msgs/msg/Quaternion"](*map(float, values[3:]))

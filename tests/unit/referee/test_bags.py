@@ -167,6 +167,30 @@ def test_the_twist_of_odometry_makes_groups(tmp_path, name):
     assert len(r.groups.names) == 5
 
 
+def test_the_time_since_a_topic_makes_groups(tmp_path):
+    drive = Drive()
+    drive.fixes = [7.05, 2.4, 0.33]
+    bag = write(tmp_path / "drive", 2, "odometry", drive)
+    [r] = read_recordings(bag, topic="/odom", truth_topic="map:body", by="since:/amcl_pose")
+    t = drive.t
+    last = np.where(t < 2.4 - 1e-9, 0.33, np.where(t < 7.05, 2.4, 7.05))
+    expected = np.where(t < 0.33, np.nan, t - last)
+    assert_allclose(r.runs.by[0], expected, atol=1e-6)
+    assert len(r.groups.names) == 5
+    found = cs.inspect(bag)
+    assert not found.command
+    assert any(
+        "--by since:/amcl_pose" in each for each in cs.inspect(bag, truth_topic="map:body", topic="/odom").findings
+    )
+
+
+def test_a_topic_since_which_no_time_is_known(tmp_path):
+    bag = write(tmp_path / "drive", 2, "odometry", Drive())
+    for topic, said in (("/gps", "is not there; there are: /odom, /tf"), ("/tf", "no message with a stamp")):
+        with pytest.raises(InputError, match=rf"drive: --by since:{topic}: .*{said}"):
+            read_recordings(bag, truth_topic="map:body", by=f"since:{topic}")
+
+
 def test_a_column_that_a_bag_does_not_hold(tmp_path):
     has = "there are: speed, turn_rate, linear_x, linear_y, linear_z, angular_x"
     for kind, truth, said in (("odometry", "map:body", has), ("pose", "/vicon", "has no columns of its own")):

@@ -36,6 +36,7 @@ SECOND = 1e-9  # s in a nanosecond
 PART = re.compile(r"(.+)_\d+")  # names of the files of one recording of ROS 2
 UNKNOWN, DIAGONAL = 0, 2  # types of covariance in sensor_msgs/NavSatFix
 TWIST = ("speed", "turn_rate", *(f"{kind}_{axis}" for kind in ("linear", "angular") for axis in "xyz"))  # for --by
+SINCE = "since:"  # before a topic, in --by: the time since its last message
 ENDLESS = 1e9  # a variance from which on it is not stated
 READING = ("reading", "bags")
 DAMAGED = "cannot be read as a ROS bag, damaged or cut short"
@@ -95,6 +96,9 @@ def _run_of(bag: Path, r: Reading) -> SpaceRun:
     """Estimates and truth of a bag, whose covariances stand in the lines, and notes on their frames."""
     with _opened(bag) as reader:
         run = _run_on(bag, reader, r, _chosen(bag, reader, r.sources.topic), ", of poses or PARENT:CHILD of /tf")
+        if r.groups.by is not None and r.groups.by.startswith(SINCE):
+            ages = _since(bag, reader, r.groups.by.removeprefix(SINCE), run.own.values[:, 0])
+            run = replace(run, own=replace(run.own, columns={**run.own.columns, r.groups.by: ages}))
     numbers = 4 if isinstance(run.true, Fixes) else POSE_NUMBERS  # of a row before its covariance
     of_truth = r.truth.truth_covariance
     if of_truth not in (None, COLUMNS):
@@ -326,6 +330,18 @@ def _track(bag: Path, topic: str, rows: Iterable[Array]) -> Lines:
         raise InputError(f"{bag}, {topic}: {what}")
     columns = dict(zip(TWIST, values[:, POSE_NUMBERS + FULL :].T, strict=False))
     return Lines(bag, values[:, : POSE_NUMBERS + FULL], first + 1, unit=f"message of {topic}", columns=columns)
+
+
+def _since(bag: Path, reader: Any, topic: str, t: Array) -> Array:
+    """Seconds since the last message of a topic at the times t (N,), by their stamps; NaN before the first one."""
+    if topic not in reader.topics:
+        raise InputError(f"{bag}: --by {SINCE}{topic}: is not there; there are: {', '.join(sorted(reader.topics))}")
+    messages = [each for each in _messages(reader, topic) if hasattr(each, "header")]
+    if not messages:
+        raise InputError(f"{bag}: --by {SINCE}{topic}: has no message with a stamp")
+    stamps = np.sort([_stamp(each.header) for each in messages])
+    last = np.searchsorted(stamps, t + SECOND, side="right") - 1
+    return np.where(last < 0, np.nan, np.maximum(t - stamps[last], 0.0))
 
 
 def _twist(message: Any) -> list[float]:

@@ -242,7 +242,10 @@ class ExecutorWorkers:
                     future.add_done_callback(finished.put)
                 if not sent:
                     return
-                future = _next_of(finished)
+                try:
+                    future = finished.get(timeout=GLANCE)
+                except Empty:
+                    continue
                 batch = sent.pop(future)
                 result = _result_of(future)
                 if isinstance(result, str):
@@ -273,12 +276,6 @@ class ExecutorWorkers:
 def _pickled(work: TrialWork) -> bytes:
     """Work as it is sent; classes from ``__main__`` go with it."""
     return bytes(dumps(work))
-
-
-def _next_of(finished: SimpleQueue[Future[BatchResult]]) -> Future[BatchResult]:
-    while True:
-        with suppress(Empty):
-            return finished.get(timeout=GLANCE)
 
 
 def _result_of(future: Future[BatchResult]) -> BatchResult | str:

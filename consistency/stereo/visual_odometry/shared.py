@@ -61,7 +61,8 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
     if not measured.any():
         raise InputError("motions: all are bridges, and have no matches that could tell")
     dt = np.diff(t)
-    speed = np.array([_twist(motion.pose) for motion in motions]) / dt[:, None]
+    turns = Rotation.from_matrix([motion.pose.R for motion in motions]).as_rotvec()
+    speed = np.column_stack([[motion.pose.t for motion in motions], turns]) / dt[:, None]
     rate = np.zeros_like(speed)
     if len(motions) > 1:
         middle = 0.5 * (t[1:] + t[:-1])
@@ -95,10 +96,6 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
         Fewer than 12 motions, or shapes that do not fit.
     """
     return uncertain_truth.fit_shared(errors, J, S, np.array(list(SHARED.values())))
-
-
-def _twist(pose: RelativePose) -> Array:
-    return np.concatenate([pose.t, Rotation.from_matrix(pose.R).as_rotvec()])
 
 
 def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:

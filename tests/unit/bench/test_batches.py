@@ -10,6 +10,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -77,13 +78,16 @@ class Fake(Executor):
         return result(runs, **self.changes)
 
     def outcomes(self, work):
-        def next_of(finished):
-            if finished.empty():
-                self.work()
-            return finished.get(timeout=5.0)
+        executor = self
+
+        class Finished(SimpleQueue):
+            def get(self, *_, **__):
+                if self.empty():
+                    executor.work()
+                return super().get(timeout=5.0)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(workers, "_next_of", next_of)
+            patch.setattr(workers, "SimpleQueue", Finished)
             yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 

@@ -406,7 +406,7 @@ def challenge_command(
 def list_command(as_json: AsJson = False) -> None:
     """List scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
-    from consistency.bench.filters.guard.plain_rules import KINDS
+    from consistency.bench.filters.guard import KINDS
     from consistency.referee.system.folders import summaries
 
     shipped, filters = summaries(), filter_summaries()

@@ -92,8 +92,9 @@ def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
 
 
 class StereoFeatures(NamedTuple):
-    """Features of both images of a stereo pair and their matches, row by row of ``pairs``."""
+    """Features of both images that a rig has taken, and their matches, row by row of ``pairs``."""
 
+    rig: StereoRig
     left: Features
     right: Features
     pairs: Indices  # (M, 2), rows in left and right; each feature at most once
@@ -193,7 +194,7 @@ def stereo_matches(
         of_band = _within(left.uv[:, 1], low, high)
         groups.append(pairs[np.isin(pairs[:, 0], of_band)])
     pairs = np.concatenate(groups)
-    return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
+    return StereoFeatures(rig, left, right, pairs[np.argsort(pairs[:, 0])])
 
 
 def _within(values: Array, low: float, high: float) -> Indices:

@@ -18,7 +18,7 @@ from misbehaving import Deadly, Still
 
 import consistency as cs
 from consistency.bench.runs import workers
-from consistency.bench.runs.backends.choose_executor import executor_for
+from consistency.bench.runs.executors import executor_for
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.run_outcome import Recorded, RunOutcome, Simulated, TrialWork
 from consistency.bench.runs.workers import BatchResult, ExecutorWorkers, LocalThreads, do_batch, failed
@@ -365,6 +365,6 @@ def test_a_backend_is_chosen_by_name():
 
 def test_without_the_extra_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.delitem(sys.modules, "consistency.bench.runs.backends.dask", raising=False)
+    monkeypatch.delitem(sys.modules, "consistency.bench.runs.dask_executor", raising=False)
     with pytest.raises(cs.InputError, match="needs distributed: pip install "), executor_for("dask"):
         pass

@@ -6,6 +6,7 @@ Only :func:`relative_motion` and what else works on images needs OpenCV, the ext
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
+    from consistency.referee.diagnostics.questions.uncertain_truth import SharedError
     from consistency.stereo.visual_odometry.arrays import (
         ConsensusError,
         ConvergenceError,
@@ -21,7 +22,7 @@ with explained_import(__name__):
         registration_covariance,
         triangulation_covariance,
     )
-    from consistency.stereo.visual_odometry.odometry import SharedError, fit_shared, sensitivities, trajectory
+    from consistency.stereo.visual_odometry.odometry import fit_shared, sensitivities, trajectory
     from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, relative_motion
     from consistency.stereo.visual_odometry.relative_pose import (
         RelativePose,

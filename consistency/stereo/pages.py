@@ -22,8 +22,9 @@ from consistency.referee.document.blocks import (
     Text,
     style,
 )
-from consistency.referee.pages.write_pages import facts
+from consistency.referee.pages.write_pages import facts, write_document, write_file
 from consistency.referee.show.figures import add_legend, band, canvas, dots, log_axis, stroke
+from consistency.referee.system.folders import manifest_of, write_folder
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences
@@ -58,9 +59,6 @@ def write_sensor_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.pages.write_pages import write_document, write_file
-    from consistency.referee.system.folders import manifest_of, write_folder
-
     manifest = manifest_of(kind="characterisation", source=of.source)
     document = compose_sensor(of, manifest)
 

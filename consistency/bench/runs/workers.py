@@ -23,6 +23,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NoReturn
 
+import joblib
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
@@ -54,8 +55,6 @@ def worker_count(jobs: int) -> int:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
     if jobs > 0:
         return jobs
-    import joblib  # slow to load
-
     return int(joblib.cpu_count())
 
 

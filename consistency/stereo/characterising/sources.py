@@ -16,6 +16,7 @@ from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
+from consistency.stereo.characterising.boards import characterise_board
 from consistency.stereo.characterising.characterise import (
     GRID,
     Characterisation,
@@ -108,8 +109,6 @@ def characterise_source(source: Path, options: SourceOptions) -> MeasuredSensor:
         raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
     if options.at_rest or options.truth is not None:
         raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
-    from consistency.stereo.characterising.boards import characterise_board
-
     model = options.distortion or "full"
     return MeasuredSensor(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.diagnostics.questions import uncertain_truth
-from consistency.referee.diagnostics.questions.uncertain_truth import SharedError as SharedError
+from consistency.referee.diagnostics.questions.uncertain_truth import SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import propagated
 from consistency.referee.system.progress import progress

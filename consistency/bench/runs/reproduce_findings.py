@@ -25,6 +25,7 @@ from consistency.bench.runs.workers import worker_count
 from consistency.bench.scenario import Scenario, data_folder, load_scenario
 from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.results import Results, joined
+from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
 from consistency.referee.diagnostics.records.record import Record
 from consistency.referee.diagnostics.verdict.verdict import Verdict

@@ -1,7 +1,7 @@
 """Steps of all updates: to the observation and back, and the correction with W = S^-1/2 Cov(z, x).
 
 The correction is eq. 11 and 12 of Herath, Kodagoda & Dissanayake (2007). The covariance of the state is row-major, its
-upper half valid. Steps write to the work arrays of a trial, which are made once: no step allocates.
+upper half valid. Steps write to the scratch arrays of a trial, which are made once: no step allocates.
 
 A symmetric update of half of P costs half, and BLAS leaves the other half alone. Everything that reads or
 writes P does it here, but for the block and the rows of the robot, which are whole.

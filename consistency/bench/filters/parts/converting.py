@@ -1,4 +1,4 @@
-"""A robot-centred map whose observations are converted to its variables: parts, work arrays, motion, new landmarks.
+"""A robot-centred map whose observations are converted to its variables: parts, scratch arrays, motion, new landmarks.
 
 Where an update moves the robot and its clones, and the errors about those poses: charts of a robot-centred state.
 

@@ -6,6 +6,7 @@ Only :func:`relative_motion` and what else works on images needs OpenCV, the ext
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
+    from consistency.referee.diagnostics.questions.uncertain_truth import SharedError
     from consistency.stereo.visual_odometry.arrays import (
         ConsensusError,
         ConvergenceError,
@@ -21,13 +22,18 @@ with explained_import(__name__):
         registration_covariance,
         triangulation_covariance,
     )
-    from consistency.stereo.visual_odometry.odometry import trajectory
-    from consistency.stereo.visual_odometry.registration import register_horn, register_ransac, register_svd
+    from consistency.stereo.visual_odometry.odometry import fit_shared, sensitivities, trajectory
     from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, relative_motion
-    from consistency.stereo.visual_odometry.relative_pose import RelativePose, compose, invert
+    from consistency.stereo.visual_odometry.relative_pose import (
+        RelativePose,
+        compose,
+        invert,
+        register_horn,
+        register_ransac,
+        register_svd,
+    )
     from consistency.stereo.visual_odometry.rig import StereoRig, triangulable, triangulate
     from consistency.stereo.visual_odometry.sequence import read_image, read_sequence
-    from consistency.stereo.visual_odometry.shared import SharedError, fit_shared, sensitivities
 
 __all__ = [
     "ConsensusError",

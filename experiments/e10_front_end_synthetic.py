@@ -18,8 +18,7 @@ import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script, sibling
 from consistency.diagnostics import chi2_mean_interval
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.registration import rigid_motions
-from consistency.stereo.visual_odometry.relative_pose import euler_angles
+from consistency.stereo.visual_odometry.relative_pose import euler_angles, rigid_motions
 from consistency.vision import StereoRig, register_svd, registration_covariance, triangulate, triangulation_covariance
 
 rigs = sibling(__file__, "published_rig")

@@ -22,9 +22,8 @@ from consistency.diagnostics import Verdict, judge, make_record
 from consistency.referee.diagnostics.statistics.nees import nees
 from consistency.referee.system.stopping import write_whole
 from consistency.referee.types import Array
-from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion
-from consistency.stereo.visual_odometry.resection import diagonal_covariances
-from consistency.stereo.visual_odometry.shared import SHARED, fit_shared, sensitivities
+from consistency.stereo.visual_odometry.odometry import SHARED, fit_shared, sensitivities
+from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, diagonal_covariances
 from consistency.vision import (
     RelativePose,
     StereoRig,

@@ -21,9 +21,8 @@ from consistency.referee.parsing import reading
 from consistency.referee.types import Array
 from consistency.stereo.frontend.images_to_log import CAMERA
 from consistency.stereo.visual_odometry import tracks
-from consistency.stereo.visual_odometry.common_motion import screened
 from consistency.stereo.visual_odometry.sequence import read_number_table
-from consistency.stereo.visual_odometry.tracks import PIXELS
+from consistency.stereo.visual_odometry.tracks import PIXELS, screened
 
 SIGMA_V, SIGMA_OMEGA = 0.5, 0.05  # m/s, rad/s: white noise that the course added to the velocities
 SIGMA_PX = (1.0, 3.3, 0.7)  # rms of u, v, d against the planar truth; v carries pitch and roll

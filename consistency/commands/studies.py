@@ -111,7 +111,7 @@ def run_command(
 ) -> None:
     """Run filters on simulated trials or a recorded log."""
     from consistency.bench.filters.run_filter import resolve_filters
-    from consistency.bench.runs.backends.choose_executor import executor_for
+    from consistency.bench.runs.executors import executor_for
     from consistency.bench.runs.montecarlo import run_log, run_trials, run_until_decided
     from consistency.bench.runs.results_to_records import analyse
     from consistency.bench.scenario import load_scenario
@@ -140,7 +140,7 @@ def run_command(
         if log is not None:
             recorded = read_log(log)
             if screen is not None:
-                from consistency.stereo.visual_odometry.common_motion import screened_log, screening_line
+                from consistency.stereo.visual_odometry.tracks import screened_log, screening_line
 
                 recorded = screened_log(recorded, screen)
                 say(screening_line(recorded))
@@ -234,7 +234,7 @@ def sweep_command(
     ] = False,
 ) -> None:
     """Run filters over a grid of scenarios; map the verdicts. Each cell is run until decided."""
-    from consistency.bench.runs.backends.choose_executor import executor_for
+    from consistency.bench.runs.executors import executor_for
     from consistency.bench.sweeps.regime_map import regime_of, write_regime
     from consistency.bench.sweeps.run_sweep import open_sweep, run_sweep
     from consistency.bench.sweeps.sweep_file import load_sweep
@@ -406,7 +406,7 @@ def challenge_command(
 def list_command(as_json: AsJson = False) -> None:
     """List scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
-    from consistency.bench.filters.guard.plain_rules import KINDS
+    from consistency.bench.filters.guard import KINDS
     from consistency.referee.system.folders import summaries
 
     shipped, filters = summaries(), filter_summaries()

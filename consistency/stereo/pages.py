@@ -22,14 +22,14 @@ from consistency.referee.document.blocks import (
     Text,
     style,
 )
-from consistency.referee.pages.write_pages import facts
+from consistency.referee.pages.write_pages import facts, write_document, write_file
 from consistency.referee.show.figures import add_legend, band, canvas, dots, log_axis, stroke
+from consistency.referee.system.folders import manifest_of, write_folder
 from consistency.referee.types import Array
-from consistency.stereo.characterising.characterise import NAMES, Characterisation, Coordinate
+from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
 MEASURED = Look(COLOURS[0])
@@ -59,9 +59,6 @@ def write_sensor_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.pages.write_pages import write_document, write_file
-    from consistency.referee.system.folders import manifest_of, write_folder
-
     manifest = manifest_of(kind="characterisation", source=of.source)
     document = compose_sensor(of, manifest)
 
@@ -168,21 +165,17 @@ def _distribution(of: Characterisation) -> Figure:
 def _draw_residuals(of: Characterisation) -> Drawing:
     figure, panels = canvas(1.7, 3, 3)
     for c, axes in zip(of.coordinates, panels, strict=True):
-        _draw_histogram(axes, c)
+        edges = np.linspace(-REACH, REACH, BINS + 1)
+        height, _ = np.histogram(np.clip(c.residuals, -REACH, REACH), edges, density=True)
+        x = np.linspace(-REACH, REACH, 201)
+        axes.stairs(height, edges, fill=True, color=MEASURED.colour, alpha=0.5)
+        axes.plot(x, stats.norm.pdf(x), label="normal", **stroke(NORMAL))
+        if c.tails.weight.low > 0:
+            nu = 1.0 / c.tails.weight.value
+            density = stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05)))
+            axes.plot(x, density, label="Student's", **stroke(STUDENT))
+        axes.set(xlabel="residual / sd", ylabel="density", title=c.name)
     return add_legend(figure)
-
-
-def _draw_histogram(axes: Axes, c: Coordinate) -> None:
-    edges = np.linspace(-REACH, REACH, BINS + 1)
-    height, _ = np.histogram(np.clip(c.residuals, -REACH, REACH), edges, density=True)
-    x = np.linspace(-REACH, REACH, 201)
-    axes.stairs(height, edges, fill=True, color=MEASURED.colour, alpha=0.5)
-    axes.plot(x, stats.norm.pdf(x), label="normal", **stroke(NORMAL))
-    if c.tails.weight.low > 0:
-        nu = 1.0 / c.tails.weight.value
-        density = stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05)))
-        axes.plot(x, density, label="Student's", **stroke(STUDENT))
-    axes.set(xlabel="residual / sd", ylabel="density", title=c.name)
 
 
 def _correlation(of: Characterisation) -> tuple[Figure, ...]:

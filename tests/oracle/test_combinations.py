@@ -30,7 +30,7 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     stands_apart,
 )
-from consistency.bench.filters.kernel.update_steps import linearise_seen, make_work
+from consistency.bench.filters.kernel.update_steps import linearise_seen, make_scratch
 from consistency.bench.filters.methods.ideal import AtTruth
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.filters.textbook import basics
@@ -76,7 +76,7 @@ class Bench:
         self.s = observed_width(self.slam.sensor)
         z, _ = sensor_noise(trial.z, scenario.belief.sensor, converted=name in TRIANGULATED)
         self.labels, self.z, self.u = trial.landmark[:3], z[:3], np.array(trial.controls[0])
-        self.work = make_work(self.slam, self.n + self.w, 3, 1, trial.n_landmarks)
+        self.work = make_scratch(self.slam, self.n + self.w, 3, 1, trial.n_landmarks)
         self.work.label[:2], self.work.at[:2] = self.labels[:2], [3, 3 + self.w]
         self.x = np.concatenate([trial.start + np.array([0.3, -0.2, 0.1]), np.zeros(3 * self.w)])
         for i in range(2):

@@ -10,14 +10,15 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
+from consistency.bench.filters import guard as plain_guard
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.filters.filter_declarations import problem_of
-from consistency.bench.filters.guard import kernel_guard, plain_rules
-from consistency.bench.filters.guard.kernel_guard import guard_part, keep_agreeing
-from consistency.bench.filters.guard.plain_rules import KINDS, kept_observations, limits_of
+from consistency.bench.filters.guard import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
-from consistency.bench.filters.kernel.part_functions import make_watch
+from consistency.bench.filters.kernel.part_functions import make_guard_arrays
+from consistency.bench.filters.parts import guard as kernel_guard
+from consistency.bench.filters.parts.guard import guard_part, keep_agreeing
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Observation
@@ -87,7 +88,7 @@ ORACLES = {"gate": by_gate, "joint": by_subsets, "ransac": by_updates}
 
 def by_kernel(kind, step):
     guard = guard_part(kind, SETTINGS, step.s, step.m)
-    watch = make_watch(guard, step.s, step.m, step.m, step.m)
+    watch = make_guard_arrays(guard, step.s, step.m, step.m, step.m)
     assert keep_agreeing(guard, step.s, step.m, step.y, np.triu(step.S), watch)  # the upper half alone
     return np.array(watch.kept)
 
@@ -107,7 +108,7 @@ def test_decisions_are_those_of_the_definitions(kind, rng):
 
 @pytest.mark.parametrize("nodes", [1, 3, 7, 20])
 def test_a_search_that_is_cut_short_is_so_at_the_same_node(nodes, rng, monkeypatch):
-    for module in (plain_rules, kernel_guard):
+    for module in (plain_guard, kernel_guard):
         monkeypatch.setattr(module, "MOST_NODES", nodes)
     for _ in range(40):
         step = Step(rng, 6, 3)
@@ -119,7 +120,7 @@ def test_a_covariance_that_is_not_definite_ends_the_run(rng):
     step = Step(rng, 2, 3)
     step.S[2, 2] = -1.0
     guard = guard_part("gate", SETTINGS, 3, 2)
-    watch = make_watch(guard, 3, 2, 2, 2)
+    watch = make_guard_arrays(guard, 3, 2, 2, 2)
     assert not keep_agreeing(guard, 3, 2, step.y, step.S, watch)
     with pytest.raises(np.linalg.LinAlgError):
         kept_observations("gate", step.y, step.S, 3, limits_of(SETTINGS, 3, 2))

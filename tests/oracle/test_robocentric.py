@@ -16,7 +16,7 @@ from consistency.bench.filters.parts.converting import (
     _is_driven_through,
     aim_chained,
     cast_columns,
-    converting_room,
+    converting_arrays,
     take_root,
     unchain,
 )
@@ -348,7 +348,7 @@ def test_the_chain_of_the_kernel_is_that_of_its_twin(rng, on):
     moved, C = inverse_range.chained(poses, xi, on=on)
     pixels = Pixels(1.0, 1.0, 1.0, Growth(np.ones(1), np.ones(1)), 0.0, 0.0, False, False, False)
     update = Converting(pixels, 20, 12, clones, True, True, True, True, 0.0, 1.0, True, 0.0025, 0.0004, 0.03, 0.4, 0.8)
-    room = converting_room(update, 3, 3, m, 30)
+    room = converting_arrays(update, 3, 3, m, 30)
     room.number[:], room.on[0], size = number, on, 3 + 3 * (m + clones)
     places = np.array([3 + 3 * (m + c) for c in range(clones)] + [0])[:, None] + np.arange(3)
     room.delta[places] = xi

@@ -15,7 +15,6 @@ from consistency.stereo.visual_odometry.maximum_likelihood import (
     triangulation_derivatives,
 )
 from consistency.stereo.visual_odometry.maximum_likelihood import cost_derivatives as two_frame_derivatives
-from consistency.stereo.visual_odometry.rig import solved
 from consistency.vision import RelativePose, StereoRig, register_svd, triangulate
 
 TOLERANCE = 1e-8  # of the largest entry
@@ -60,7 +59,8 @@ def test_triangulation(rng):
     """Eq. 2.25 at noisy matches, where the residual's part of the mixed derivative is not zero."""
     points = rng.uniform([-2, -1, 3], [2, 1, 9], (5, 3))
     uv = RIG.project(points) + rng.normal(0, 2, (5, 4))
-    A, b, p = solved(RIG, uv)
+    A, b = RIG.equations(uv)
+    A, b, p = np.moveaxis(A, -1, 0), b.T, triangulate(RIG, uv)
     C_pp, C_pu = triangulation_derivatives(RIG, A, b, p)
 
     def cost(x):  # x: p, u

@@ -9,7 +9,7 @@ import pytest
 from rigs import RIG
 from scipy import stats
 
-from consistency.stereo.visual_odometry.registration import rigid_motions
+from consistency.stereo.visual_odometry.relative_pose import rigid_motions
 from consistency.vision import (
     RelativePose,
     refine_reprojection,

@@ -24,7 +24,7 @@ from documents import PAGES, PROGRAMS, ROOT, SHELL, blocks, commands, parsed, re
 import consistency as cs
 from consistency.bench.challenging.world_space import space_of
 from consistency.bench.filters import filter_names
-from consistency.bench.filters.guard.plain_rules import KINDS
+from consistency.bench.filters.guard import KINDS
 from consistency.bench.runs.reproduce_findings import experiments
 from consistency.bench.scenario import data_folder, scenario_names
 from consistency.bench.sweeps.sweep_file import load_sweep, sweep_names

@@ -176,7 +176,7 @@ def test_the_package_itself_loads_nothing_heavy():
 def test_engines_of_clusters_are_loaded_when_they_are_chosen():
     engines = {"dask", "distributed", "submitit"}
     choose = "import consistency.bench.runs.montecarlo\n"
-    choose += "from consistency.bench.runs.backends.choose_executor import executor_for\n"
+    choose += "from consistency.bench.runs.executors import executor_for\n"
     choose += "with executor_for({!r}): pass"
     assert not loaded(choose.format("local")) & engines
     assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}

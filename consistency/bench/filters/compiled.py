@@ -15,12 +15,11 @@ from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.filter_declarations import is_realisable, problem_for
-from consistency.bench.filters.guard.guarded import Guarded
-from consistency.bench.filters.guard.kernel_guard import guard_part
-from consistency.bench.filters.guard.plain_rules import KINDS
+from consistency.bench.filters.guard import KINDS, Guarded
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.filters.kernel.update_steps import REASONS
+from consistency.bench.filters.parts.guard import guard_part
 from consistency.bench.filters.parts.local import LOCAL_FROM, Local
 from consistency.bench.filters.parts.parking import Parking
 from consistency.bench.protocols import Filter, Problem

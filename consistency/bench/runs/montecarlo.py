@@ -20,7 +20,6 @@ from consistency.bench.filters.run_filter import resolve_filters
 from consistency.bench.protocols import Filter
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.outcomes_to_results import PLAN, StudyRounds, gathered_in
-from consistency.bench.runs.outcomes_to_results import Interrupted as Interrupted
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_outcome import Recorded, Simulated, TrialWork, Workers
 from consistency.bench.runs.workers import ExecutorWorkers, LocalThreads

@@ -118,18 +118,18 @@ class StudyRounds:
                     self.workers.prepare(self.work, todo[0])
                     started, is_ready = time.monotonic(), True
                 if todo:
-                    self._do(todo)
+                    with (
+                        closing(self.workers.outcomes(self.work, todo)) as outcomes,
+                        progress("runs", len(todo)) as advance,
+                    ):
+                        for outcome in outcomes:
+                            self.gathered.add(outcome)
+                            advance(1)
         except KeyboardInterrupt:
             if self.gathered.journal.is_on_disk:
                 raise
             raise Interrupted(self._results(runs, started)) from None
         return self._results(runs, started)
-
-    def _do(self, runs: Sequence[int]) -> None:
-        with closing(self.workers.outcomes(self.work, runs)) as outcomes, progress("runs", len(runs)) as advance:
-            for outcome in outcomes:
-                self.gathered.add(outcome)
-                advance(1)
 
     def _results(self, runs: Sequence[int], started: float) -> Results | StoredResults:
         """The results of what is there, of which ``runs`` were asked for."""

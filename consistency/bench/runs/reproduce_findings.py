@@ -162,7 +162,10 @@ def reproduce(
     selection = _selection(scripts, only, long)
     require_free(out, overwrite, "findings")
     study, started = Study(runs, seed, jobs, only=only), time.monotonic()
-    _compile(selection, study.workers)
+    # side by side, and before the first of the scripts
+    needs = [need for module, _ in selection for need in getattr(module, "KERNELS", {}).items()]
+    pairs = [(get_filter(name), load_scenario(world)) for world, names in needs for name in names]
+    compile_all(first_trials(pairs), study.workers)
     findings = _findings_of(study, selection)
     study.write(out, findings, time.monotonic() - started, overwrite, [] if only else left_out(findings))
     return findings
@@ -183,13 +186,6 @@ def _how(name: str, module: ModuleType) -> str:
     if hasattr(module, "NOT_SHIPPED"):
         return f"python experiments/{name}.py --data DIR --out DIR; not shipped: {module.NOT_SHIPPED}"
     return f"consistency reproduce --only {name}" + (f"; needs {module.NEEDS}" if hasattr(module, "NEEDS") else "")
-
-
-def _compile(selection: Sequence[tuple[ModuleType, Sequence[str]]], jobs: int) -> None:
-    """Compile what the scripts say that they need, side by side and before the first of them."""
-    needs = [need for module, _ in selection for need in getattr(module, "KERNELS", {}).items()]
-    pairs = [(get_filter(name), load_scenario(world)) for world, names in needs for name in names]
-    compile_all(first_trials(pairs), jobs)
 
 
 def _selection(

@@ -170,7 +170,9 @@ def _rejected(trial: Trial, estimates: Estimates, rejected: Array) -> Rejected:
 def _rows(trial: Trial, estimates: Estimates) -> tuple[Estimates, Columns]:
     """Rows of ``estimates``, with what they are of: a run fails in the first step with a number that is too large."""
     last, own = _last(trial, estimates), estimates.own
-    first = _full_rank((estimates.covariance if own is None else own)[:last])
+    # an additive covariance that is computed from ``own`` has small variances where there are none, left by rounding
+    decisive = (estimates.covariance if own is None else own)[:last]
+    first = next((k for k in range(last) if definiteness(decisive[k]) == 1), last)  # that has full rank
     columns = _columns(trial, estimates, last, first)
     step, reason = _first_failure(columns, first, trial.truth is not None)
     map_numbers = () if estimates.map is None else (estimates.map.mean, estimates.map.covariance)
@@ -224,15 +226,6 @@ def _columns(trial: Trial, estimates: Estimates, last: int, first: int) -> Colum
         P, error = estimates.own[:last], None if true is None else planar_error(true, pose, estimates.error)
         columns |= {name: P[:, i, j] for name, (i, j) in OWN_COVARIANCE.items()} | {"own_nees": _nees(error, P, first)}
     return columns
-
-
-def _full_rank(P: Array) -> int:
-    """First of the covariances (T, 3, 3) that has full rank, or T.
-
-    That of the filter's own error decides: an additive one that is computed from it has small variances where there
-    are none, left by rounding.
-    """
-    return next((k for k in range(len(P)) if definiteness(P[k]) == 1), len(P))
 
 
 def _nees(error: Array | None, P: Array, first: int) -> Array:
@@ -330,7 +323,14 @@ def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
             filter_.compile(trial, belief)
     missing = [need for need in needs.values() if not need.outlook.is_ready]
     if missing:
-        _compile(missing, jobs)
+        shared_kernels = [need for need in missing if need.outlook.is_shared]
+        workers = min(jobs, len(shared_kernels))
+        if jit.folder_fault():
+            workers = 1
+        progress.announce(f"{_label(missing)}, once: {EACH}")
+        if workers > 1:
+            _compile_side_by_side(shared_kernels, workers)
+        away_from_signals(_compile_here, missing)
     return list(needs.values())
 
 
@@ -344,17 +344,6 @@ def first_trials(worlds: Iterable[tuple[Filter, Scenario]]) -> Iterator[Wanted]:
                 trials[world.hash] = require_landmarks_in_view(world).trial(0, 0)
         if (trial := trials[world.hash]) is not None:
             yield filter_, trial, world.belief
-
-
-def _compile(missing: Sequence[Need], jobs: int) -> None:
-    shared_kernels = [need for need in missing if need.outlook.is_shared]
-    workers = min(jobs, len(shared_kernels))
-    if jit.folder_fault():
-        workers = 1
-    progress.announce(f"{_label(missing)}, once: {EACH}")
-    if workers > 1:
-        _compile_side_by_side(shared_kernels, workers)
-    away_from_signals(_compile_here, missing)
 
 
 def _compile_here(needs: Sequence[Need]) -> None:
@@ -382,13 +371,10 @@ def _compile_side_by_side(needs: Sequence[Need], workers: int) -> None:
     pool = ProcessPoolExecutor(workers, context=context, initializer=_begin_compiler, initargs=initargs)
     try:
         with contextlib.suppress(Exception):  # no more processes, or a filter that cannot be sent
-            wait([pool.submit(_compile_one, _pickled(need)) for need in largest_first])
+            pickled_needs = [bytes(dumps((need.filter, need.trial, need.belief))) for need in largest_first]
+            wait([pool.submit(_compile_one, pickled) for pickled in pickled_needs])
     finally:
         pool.shutdown(kill_workers=True)
-
-
-def _pickled(need: Need) -> bytes:
-    return bytes(dumps((need.filter, need.trial, need.belief)))
 
 
 def _begin_compiler(parent: int, alive: Connection) -> None:

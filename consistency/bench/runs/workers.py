@@ -23,6 +23,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NoReturn
 
+import joblib
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
@@ -54,8 +55,6 @@ def worker_count(jobs: int) -> int:
         raise InputError(f"jobs must be at least 1, or -1 for one worker a core, got {jobs}")
     if jobs > 0:
         return jobs
-    import joblib  # slow to load
-
     return int(joblib.cpu_count())
 
 
@@ -242,7 +241,10 @@ class ExecutorWorkers:
                     future.add_done_callback(finished.put)
                 if not sent:
                     return
-                future = _next_of(finished)
+                try:
+                    future = finished.get(timeout=GLANCE)
+                except Empty:
+                    continue
                 batch = sent.pop(future)
                 result = _result_of(future)
                 if isinstance(result, str):
@@ -273,12 +275,6 @@ class ExecutorWorkers:
 def _pickled(work: TrialWork) -> bytes:
     """Work as it is sent; classes from ``__main__`` go with it."""
     return bytes(dumps(work))
-
-
-def _next_of(finished: SimpleQueue[Future[BatchResult]]) -> Future[BatchResult]:
-    while True:
-        with suppress(Empty):
-            return finished.get(timeout=GLANCE)
 
 
 def _result_of(future: Future[BatchResult]) -> BatchResult | str:

@@ -324,16 +324,14 @@ class BiasMap(Table):
         """Biases (..., 3) of u, v and d at pixels ``u``, ``v`` (...) from the principal point, all in px."""
         left, right, across = _between(np.asarray(u, float), self.u)
         low, high, down = _between(np.asarray(v, float), self.v)
-        table = self._table()
+        zero = np.zeros((len(self.v), len(self.u)))
+        table = np.stack(
+            [np.array(getattr(self, key)) if getattr(self, key) else zero for key in MATRICES], axis=-1
+        )  # (L, K, 3)
         near = table[low, left] + across * (table[low, right] - table[low, left])
         far = table[high, left] + across * (table[high, right] - table[high, left])
         bias: Array = near + down * (far - near)
         return bias
-
-    def _table(self) -> Array:
-        """All three matrices, (L, K, 3)."""
-        zero = np.zeros((len(self.v), len(self.u)))
-        return np.stack([np.array(getattr(self, key)) if getattr(self, key) else zero for key in MATRICES], axis=-1)
 
 
 def _between(x: Array, nodes: tuple[float, ...]) -> tuple[Array, Array, Array]:

@@ -61,7 +61,12 @@ class Journal:
         with self._faults():
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False)
             try:
-                self._prepare()
+                # exclusive before WAL: then SQLite needs no shared memory, which network disks lack
+                self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
+                self._database.execute("PRAGMA journal_mode = WAL")
+                self._database.execute("PRAGMA synchronous = NORMAL")
+                self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
+                self._database.executescript(SCHEMA)
                 rows = self._database.execute("SELECT content FROM study").fetchall()
                 finished = self._database.execute("SELECT run, notes FROM finished").fetchall()
                 self.study: dict[str, Any] = json.loads(rows[0][0]) if rows else {}
@@ -70,14 +75,6 @@ class Journal:
                 raise
         self._runs = {run for run, _ in finished}
         self.notes: dict[int, dict[str, Any]] = {run: json.loads(notes) for run, notes in finished if notes}
-
-    def _prepare(self) -> None:
-        # exclusive before WAL: then SQLite needs no shared memory, which network disks lack
-        self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
-        self._database.execute("PRAGMA journal_mode = WAL")
-        self._database.execute("PRAGMA synchronous = NORMAL")
-        self._database.execute("PRAGMA wal_autocheckpoint = 0")  # each waits for the disk; see CHECKPOINT_EVERY
-        self._database.executescript(SCHEMA)
 
     @property
     def is_on_disk(self) -> bool:
@@ -224,7 +221,8 @@ class Unfinished:
                 if replaced.exists() and not out.exists():  # the process ended while the results were being replaced
                     os.replace(replaced, out)
                 if overwrite and not resume:
-                    _remove_journals(self.path)
+                    for name in (EARLIER, DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"):
+                        (self.path / name).unlink(missing_ok=True)
                 if (self.path / EARLIER).exists():
                     raise InputError(
                         f"--out {out}: unfinished work of an earlier version is there; finish it with that version, or "
@@ -277,8 +275,3 @@ class Unfinished:
             if self.path.exists():
                 return lock
             lock.release()
-
-
-def _remove_journals(folder: Path) -> None:
-    for name in (EARLIER, DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"):
-        (folder / name).unlink(missing_ok=True)

@@ -83,7 +83,8 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         return read_parquet(folder, name)
     if not is_file(path):
         raise InputError(f"{path}: is not a file")
-    column_names = _header(path)
+    with reading(path, DAMAGED), path.open(encoding="utf-8-sig") as file:
+        column_names = [name.strip('"') for name in file.readline(2**16).strip().split(",")]
     needed_columns = dict.fromkeys((*COLUMNS[name], *also))
     if missing_columns := [column for column in needed_columns if column not in column_names]:
         raise InputError(f"{path}: column '{missing_columns[0]}' is missing; needed: {', '.join(needed_columns)}")
@@ -99,11 +100,6 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
     for column, kind in column_types.items():
         check_column(path, table[column], kind)
     return table.astype(column_types)
-
-
-def _header(path: Path) -> list[str]:
-    with reading(path, DAMAGED), path.open(encoding="utf-8-sig") as file:
-        return [name.strip('"') for name in file.readline(2**16).strip().split(",")]
 
 
 STRAY = 0.05  # share of pixels that gross errors may put outside the image; other units put more there

@@ -66,14 +66,11 @@ class Regime:
         """Rows by cell and filter: the value on each axis, the filter, and the fields of :class:`CellResult`."""
         axes, rows = self.sweep.axes, []
         for cell in self.sweep.cells:
-            values = [_table_value(axis.values[i]) for axis, i in zip(axes, cell.indices, strict=True)]
+            own = [axis.values[i] for axis, i in zip(axes, cell.indices, strict=True)]
+            values = [value if isinstance(value, int | float | str) else json.dumps(value) for value in own]
             for name, result in self.at(cell).items():
                 rows.append([*values, name, *(getattr(result, field) for field in FIELDS)])
         return pd.DataFrame(rows, columns=[*(axis.key for axis in axes), "filter", *FIELDS])
-
-
-def _table_value(axis_value: Any) -> Any:
-    return axis_value if isinstance(axis_value, int | float | str) else json.dumps(axis_value)
 
 
 def ranked_by_cost(results: Mapping[str, CellResult]) -> list[tuple[str, CellResult]]:
@@ -120,12 +117,6 @@ def dumped(regime: Regime) -> str:
     return f'{manifest_json},\n "rows": [\n  ' + ",\n  ".join(result_rows) + "\n ]\n}\n"
 
 
-def _shipped_map() -> Path:
-    """Return the path of the map that comes with the package."""
-    path = data_folder("reference") / SHIPPED
-    return path if path.is_file() else data_folder("reports") / "reference" / SHIPPED
-
-
 def read_regime(path: Path | None = None) -> Regime:
     """A map from ``map.json``, from a folder of ``consistency sweep``, or the shipped one.
 
@@ -135,7 +126,8 @@ def read_regime(path: Path | None = None) -> Regime:
         There is none, or it is damaged.
     """
     if path is None:
-        path = _shipped_map()
+        path = data_folder("reference") / SHIPPED
+        path = path if path.is_file() else data_folder("reports") / "reference" / SHIPPED
         if not path.is_file():
             raise InputError(
                 "no map is shipped with this version; make one with 'consistency sweep regime --out regime' (about 20 "

@@ -254,7 +254,9 @@ def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
         raise InputError(f"{name}: a value is given twice; each may stand once")
     for value in values:
         if key in QUANTITIES:
-            _require_quantity(name, key, value)
+            low, kind = (0.0, "positive numbers") if QUANTITIES[key].positive else (-math.inf, "numbers")
+            if not is_number(value) or not low < value < math.inf:
+                raise InputError(f"{name}: values must be {kind}, got {value!r}")
         if is_number(value) and not -HUGE <= value <= HUGE:
             raise InputError(f"{name}: numbers must be finite, and {HUGE:g} at most")
     if all(map(is_number, values)):
@@ -263,12 +265,6 @@ def _axis(table: str, key: str, values: Any, base: Scenario) -> Axis:
     axis = Axis(key, tuple(values), None if table == "grid" else 0)
     require_key(axis, base)
     return axis if table == "grid" else alone(axis, base)
-
-
-def _require_quantity(name: str, key: str, value: Any) -> None:
-    low, kind = (0.0, "positive numbers") if QUANTITIES[key].positive else (-math.inf, "numbers")
-    if not is_number(value) or not low < value < math.inf:
-        raise InputError(f"{name}: values must be {kind}, got {value!r}")
 
 
 def alone(axis: Axis, base: Scenario) -> Axis:
@@ -333,20 +329,11 @@ class Quantity:
     positive: bool = True  # whether values must be
 
 
-def _baseline(base: Scenario) -> float:
-    return np.nan if base.truth.sensor.rig is None else base.truth.sensor.rig[1]
-
-
 def _density_changes(base: Scenario, value: float) -> Changes:
     landmarks = base.truth.landmarks
     if not isinstance(landmarks, UniformLandmarks):
         raise ValueError("needs truth.landmarks.layout = 'uniform', whose count it multiplies")
     return {"truth.landmarks.count": max(1, round(landmarks.count * value))}
-
-
-def _interval_changes(base: Scenario, value: float) -> Changes:
-    """Fewer steps where each is longer, so that the drive stays."""
-    return {"truth.dt": value, "truth.steps": max(1, round(base.truth.steps * base.truth.dt / value))}
 
 
 def _tilt(base: Scenario) -> float:
@@ -371,12 +358,18 @@ def _loops_changes(base: Scenario, value: float) -> Changes:
 
 
 QUANTITIES: dict[str, Quantity] = {
-    "baseline": Quantity("baseline", "m", baseline_changes, _baseline),
+    "baseline": Quantity("baseline", "m", baseline_changes, lambda base: (base.truth.sensor.rig or (0.0, np.nan))[1]),
     "range": Quantity("range of landmarks", "m", range_changes, lambda base: float(base.truth.sensor.range[1])),
     "density": Quantity("density of landmarks", "×", _density_changes),
     "odometry": Quantity("noise of the odometry", "×", odometry_changes),
     "speed": Quantity("speed", "m/s", lambda _, value: {"truth.path.speed": value}, lambda base: base.truth.path.speed),
-    "dt": Quantity("time of a step", "s", _interval_changes, lambda base: base.truth.dt),
+    "dt": Quantity(
+        "time of a step",
+        "s",
+        # fewer steps where each is longer, so that the drive stays
+        lambda base, dt: {"truth.dt": dt, "truth.steps": max(1, round(base.truth.steps * base.truth.dt / dt))},
+        lambda base: base.truth.dt,
+    ),
     "tilt": Quantity("tilt", "deg", tilt_changes, _tilt, positive=False),
     "height": Quantity("height", "m", height_changes, _height, positive=False),
     "loops": Quantity("number of loops", "×", _loops_changes),

@@ -190,7 +190,7 @@ def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     trials = [simulated(run) for run in range(runs)]
 
     def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
-        return run_trials(with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
+        return run_trials(scenario_with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
 
     runs_text = _runs(runs)
     judged_on = f"{runs_text} that the fit has not seen"
@@ -247,7 +247,7 @@ def part_of(trial: Trial, start: int, end: int) -> Trial:
     )
 
 
-def with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
+def scenario_with_belief(scenario: Scenario, belief: Belief, name: str | None = None) -> Scenario:
     """The scenario with another belief."""
     return scenario.variant(name or scenario.name, belief=belief.model_dump(), summary=scenario.summary)
 
@@ -391,7 +391,7 @@ def files(tuning: Tuning) -> dict[str, str]:
     if isinstance(world, Log):
         return {"sensor.toml": f"# {comment}\n{sensor_text(Path(world.name), belief)}"}
     name = f"{world.name}-tuned"
-    return {f"{name}.toml": scenario_text(with_belief(world, belief, name), comment)}
+    return {f"{name}.toml": scenario_text(scenario_with_belief(world, belief, name), comment)}
 
 
 def _next(tuning: Tuning, out: Path) -> str:

@@ -473,15 +473,11 @@ def steps_of_both(slopes: list[Slopes], at: list[Indices], steps: int) -> tuple[
         by_points = np.einsum("tnij,tjk,tmlk->tnmil", W, s.cov, W)
         np.subtract.at(N, (own[:, :, None], own[:, None, :]), by_points)
     flat = N.swapaxes(1, 2).reshape(steps * POSE, -1)
-    Q = _inverse(flat).reshape(steps, POSE, steps, POSE)
+    # inverse on all but the six directions in which poses and points move together, which no observation tells
+    values, axes = np.linalg.eigh(flat)
+    Q = ((axes[:, POSE:] / values[POSE:]) @ axes[:, POSE:].T).reshape(steps, POSE, steps, POSE)
     moves = np.einsum("siuj,uj->si", Q, g)
     return [_step(s, own, Q, moves) for s, own in zip(slopes, at, strict=True)], moves
-
-
-def _inverse(N: Array) -> Array:
-    """Inverse on all but the six directions in which poses and points move together, which no observation tells."""
-    values, axes = np.linalg.eigh(N)
-    return (axes[:, POSE:] / values[POSE:]) @ axes[:, POSE:].T
 
 
 def _step(

@@ -39,7 +39,12 @@ def sentences(of: Characterisation) -> list[str]:
     texts.append(_growth(of))
     if of.bias is not None:
         texts.append(_bias(of.bias))
-    texts.append(_gross(of))
+    what = "are more than"
+    if of.bias is None:
+        what = "are of tracks that are somewhere more than"
+    texts.append(
+        f"{interval(of.gross, 2, 100.0)} % of the observations {what} 6 robust sd off, and are not part of sigma."
+    )
     if of.ratio:
         ratios = [f"{name} {interval(ratio, 3)}" for name, ratio in zip(NAMES, of.ratio, strict=True)]
         texts.append(f"Noise while moving over noise at rest: {', '.join(ratios)}.")
@@ -117,13 +122,6 @@ def _bias(bias: BiasEstimate) -> str:
     if hidden:
         text += f"; none is shown in {' and '.join(hidden)}"
     return f"{text}.{unknown}"
-
-
-def _gross(of: Characterisation) -> str:
-    what = "are more than"
-    if of.bias is None:
-        what = "are of tracks that are somewhere more than"
-    return f"{interval(of.gross, 2, 100.0)} % of the observations {what} 6 robust sd off, and are not part of sigma."
 
 
 def counted(of: Characterisation) -> str:

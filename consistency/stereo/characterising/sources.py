@@ -16,6 +16,7 @@ from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array
+from consistency.stereo.characterising.boards import characterise_board
 from consistency.stereo.characterising.characterise import (
     GRID,
     Characterisation,
@@ -97,25 +98,19 @@ def characterise_source(source: Path, options: SourceOptions) -> MeasuredSensor:
             "so not what its disparities should be"
         )
     if options.board is None or options.square is None:
-        return _of_sequence(source, options)
+        if options.distortion is not None:
+            raise InputError("--distortion: goes with --board; other images bring their calibration")
+        if options.grid is not None:
+            raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
+        return MeasuredSensor(characterise_images(source, options), {})
     if not 0.0 < options.square < WIDEST:
         raise InputError(f"--square {options.square:g}: must be a positive number of metres, below {WIDEST:g}")
     if options.seed is not None:
         raise InputError("--seed: goes with images without a board; nothing is drawn at random from one")
     if options.at_rest or options.truth is not None:
         raise InputError("--board: goes neither with --at-rest nor with --truth; the poses of the board are fitted")
-    from consistency.stereo.characterising.boards import characterise_board
-
     model = options.distortion or "full"
     return MeasuredSensor(characterise_board(source, options.board, options.square, model, options.grid or GRID), {})
-
-
-def _of_sequence(source: Path, options: SourceOptions) -> MeasuredSensor:
-    if options.distortion is not None:
-        raise InputError("--distortion: goes with --board; other images bring their calibration")
-    if options.grid is not None:
-        raise InputError("--grid: goes with a log or with --board; images of an unknown scene give no bias map")
-    return MeasuredSensor(characterise_images(source, options), {})
 
 
 def parse_counts(text: str, option: str, least: int) -> tuple[int, int]:
@@ -219,7 +214,11 @@ def seen_of(trials: Sequence[Trial], mount: Mount, rests: Sequence[Array] | None
         order = np.lexsort((trial.step, track))
         order = order[rest_of_row[order] >= 0]
         step = trial.step[order]
-        R, t = _sensor_poses(pose, mount)
+        # the sensor in the world, (T + 1, 3, 3) and (T + 1, 3), from poses on the plane
+        turns = Rotation.from_euler("z", pose[:, 2:]).as_matrix()
+        place = np.pad(pose[:, :2], ((0, 0), (0, 1)))
+        R = turns @ rotation(*mount.rotation)
+        t = place + turns @ np.array(mount.position)
         moving = moved_before(pose)
         parts.append((trial.z[order], R[step], t[step], tracks + track[order], step, moving[step]))
         tracks += trial.n_landmarks * (int(rest.max()) + 1)
@@ -236,13 +235,6 @@ def _in_space(trial: Trial, path: Path) -> Sightings:
     step = trial.step[order]
     moving = np.ones(len(step), bool)
     return Sightings(trial.z[order], R[step], t[step], trial.landmark[order], step, moving)
-
-
-def _sensor_poses(pose: Array, mount: Mount) -> tuple[Array, Array]:
-    """Rotation (T + 1, 3, 3) and place (T + 1, 3) of the sensor in the world from poses on the plane."""
-    turns = Rotation.from_euler("z", pose[:, 2:]).as_matrix()
-    place = np.pad(pose[:, :2], ((0, 0), (0, 1)))
-    return turns @ rotation(*mount.rotation), place + turns @ np.array(mount.position)
 
 
 def _rests(trial: Trial, always: bool) -> Array:
@@ -268,7 +260,12 @@ def characterise_images(folder: Path, options: SourceOptions) -> Characterisatio
         raise InputError(f"{folder}: holds {len(sequence)} stereo pairs; a noise takes at least {SHORTEST}")
     R, t = _poses(sequence, options)
     motions = visual_odometry(sequence, rng=np.random.default_rng(options.seed or 0))
-    seen = _seen(rig, motions, R, t)
+    rows = observations(rig, motions)
+    rows = rows[rows["z2"] > 0]
+    step = rows["step"].to_numpy(np.int64)
+    track = rows["piece"].to_numpy(np.int64)
+    moving = np.full(len(step), np.ptp(t, axis=0).any())
+    seen = Sightings(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
     notes = []
     if options.at_rest:
         notes.append(REST)
@@ -305,20 +302,6 @@ def uncalibrated_noise_sensor(rig: StereoRig) -> PicturedSensor:
         image=rig.image_size,
         principal_point=rig.principal_point,
     )
-
-
-def _seen(
-    rig: StereoRig,
-    motions: list[RelativeMotion],
-    R: Array,
-    t: Array,
-) -> Sightings:
-    rows = observations(rig, motions)
-    rows = rows[rows["z2"] > 0]
-    step = rows["step"].to_numpy(np.int64)
-    track = rows["piece"].to_numpy(np.int64)
-    moving = np.full(len(step), np.ptp(t, axis=0).any())
-    return Sightings(rows[PIXELS].to_numpy(float), (R @ CAMERA)[step], t[step], track, step, moving)
 
 
 def rows_note(rig: StereoRig, motions: list[RelativeMotion]) -> str:

@@ -76,7 +76,9 @@ def read_truth(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
         elif _columns(path) == 12:
             R, t = _kitti(path, len(sequence))
         else:
-            R, t = _tum(path, sequence)
+            stamps, R, t = tum_poses(path)
+            own = _matched(path, sequence.t, stamps)
+            R, t = R[own], t[own]
     return R @ sequence.rectification.turn.T, t
 
 
@@ -94,12 +96,6 @@ def tum_poses(path: Path) -> tuple[Array, Array, Array]:
     lines = read_trajectory(path, true=True)
     R = Rotation.from_quat(lines.values[:, 4:8]).as_matrix()
     return lines.t, R, lines.values[:, 1:4]
-
-
-def _tum(path: Path, sequence: StereoSequence) -> tuple[Array, Array]:
-    stamps, R, t = tum_poses(path)
-    own = _matched(path, sequence.t, stamps)
-    return R[own], t[own]
 
 
 def _kitti(path: Path, frames: int) -> tuple[Array, Array]:

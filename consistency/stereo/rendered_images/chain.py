@@ -202,7 +202,10 @@ class Chain:
                 self._require_depths(scene, camera, frame.pose)
                 state = _begin(self, frame, scene, camera)
             else:
-                _follow(self, state, frame, camera)
+                true = camera.left.project(to_camera(frame.pose, state.anchors))
+                state.uv, found = self.tracking.follow(state.image, frame.left, state.uv, true)
+                state.image = frame.left
+                state.keep(found & camera.inside(state.uv, EDGE))
             parts.append(_observed(self, state, number, frame, camera))
         if state is None:
             raise InputError("frames: there is none; give at least one image pair")
@@ -268,18 +271,6 @@ def _begin(
         patch=patches(frame.left, uv, np.ones(len(uv))),
         d=d[good],
     )
-
-
-def _follow(
-    chain: Chain,
-    state: _State,
-    frame: StereoFrame,
-    camera: StereoCamera,
-) -> None:
-    true = camera.left.project(to_camera(frame.pose, state.anchors))
-    state.uv, found = chain.tracking.follow(state.image, frame.left, state.uv, true)
-    state.image = frame.left
-    state.keep(found & camera.inside(state.uv, EDGE))
 
 
 def _observed(

@@ -92,8 +92,9 @@ def sift(image: Array, count: int = COUNT, name: str = "image") -> Features:
 
 
 class StereoFeatures(NamedTuple):
-    """Features of both images of a stereo pair and their matches, row by row of ``pairs``."""
+    """Features of both images that a rig has taken, and their matches, row by row of ``pairs``."""
 
+    rig: StereoRig
     left: Features
     right: Features
     pairs: Indices  # (M, 2), rows in left and right; each feature at most once
@@ -180,8 +181,11 @@ def stereo_matches(
     Rectified images are matched in bands of rows. Around a band, the right features reach ``tolerance`` further and
     the left ones twice that, so that each left feature of the band and each right one it may match has all its rivals.
     """
+    edges = np.array([-np.inf, np.inf])
+    if is_rectified(rig):
+        edges = np.insert(edges, 1, np.arange(BAND, rig.image_size[1], BAND))
     groups = [np.empty((0, 2), np.int64)]
-    for low, high in _bands(rig):
+    for low, high in itertools.pairwise(edges):
         i = _within(left.uv[:, 1], low - 2 * tolerance, high + 2 * tolerance)
         j = _within(right.uv[:, 1], low - tolerance, high + tolerance)
         allowed = epipolar_gate(rig, left.uv[i], right.uv[j], tolerance)
@@ -190,15 +194,7 @@ def stereo_matches(
         of_band = _within(left.uv[:, 1], low, high)
         groups.append(pairs[np.isin(pairs[:, 0], of_band)])
     pairs = np.concatenate(groups)
-    return StereoFeatures(left, right, pairs[np.argsort(pairs[:, 0])])
-
-
-def _bands(rig: StereoRig) -> list[tuple[float, float]]:
-    """First row and the row behind the last of each band; one band of all rows where images are not rectified."""
-    edges = np.array([-np.inf, np.inf])
-    if is_rectified(rig):
-        edges = np.insert(edges, 1, np.arange(BAND, rig.image_size[1], BAND))
-    return list(itertools.pairwise(edges))
+    return StereoFeatures(rig, left, right, pairs[np.argsort(pairs[:, 0])])
 
 
 def _within(values: Array, low: float, high: float) -> Indices:

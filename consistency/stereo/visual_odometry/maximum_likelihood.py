@@ -28,9 +28,13 @@ from consistency.referee.geometry import propagated
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry import arrays
 from consistency.stereo.visual_odometry.arrays import ConvergenceError, DegenerateError
-from consistency.stereo.visual_odometry.registration import checked_clouds, register_svd
-from consistency.stereo.visual_odometry.relative_pose import RelativePose, rotation_derivatives
-from consistency.stereo.visual_odometry.rig import StereoRig, solved, triangulate
+from consistency.stereo.visual_odometry.relative_pose import (
+    RelativePose,
+    checked_clouds,
+    register_svd,
+    rotation_derivatives,
+)
+from consistency.stereo.visual_odometry.rig import StereoRig, triangulate
 
 Robust = Literal["huber", "cauchy"]
 TAIL = 0.05  # share of points without fault that Huber's loss treats as outliers
@@ -493,7 +497,8 @@ def triangulation_covariance(rig: StereoRig, uv: Array, S_uv: Array) -> Array:
     """
     uv = arrays.checked_rows("uv", uv, 4)
     S_uv = arrays.covariances("S_uv", S_uv, len(uv), 4)
-    C_pp, C_pu = triangulation_derivatives(rig, *solved(rig, uv))
+    A, b = rig.equations(uv)
+    C_pp, C_pu = triangulation_derivatives(rig, np.moveaxis(A, -1, 0), b.T, triangulate(rig, uv))
     return implicit_covariance(C_pp, C_pu[:, None], S_uv[:, None])
 
 

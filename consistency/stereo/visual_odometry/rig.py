@@ -118,6 +118,28 @@ class StereoRig:
         largest = np.tile(self.image_size, 2) - 1.0
         return np.asarray(((uv >= 0.0) & (uv <= largest)).all(axis=1))
 
+    def equations(self, uv: Array) -> tuple[Array, Array]:
+        """A (4, 3, N) and b (4, N) of eq. 2.3, rows in the order u, v, u', v'; sums over points run along memory."""
+        rows = self.cameras[:, :2].reshape(4, 4, 1)
+        last = self.cameras[:, 2].repeat(2, axis=0)[:, :, None]
+        A = uv.T[:, None] * last[:, :3]
+        A -= rows[:, :3]
+        return A, rows[:, 3] - uv.T * last[:, 3]
+
+    def intersections(self, uv: Array) -> tuple[Array, Array]:
+        """Least squares of eq. 2.3: points (N, 3), m, and which of them are in front of both cameras (N,)."""
+        A, b = self.equations(uv)
+        AtA = np.einsum("kin,kjn->ijn", A, A)
+        inverse, definite = arrays.symmetric_inverses(np.moveaxis(AtA, -1, 0))
+        inverse = np.moveaxis(inverse, 0, -1)
+        alone = np.einsum("iin,iin->in", inverse, AtA)
+        fixed = definite & (alone < 1.0 / FIXED).all(axis=0)
+        points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
+        depth = self.cameras[:, 2, :3] @ points + self.cameras[:, 2, 3:]
+        far_enough = (depth > NEAREST * self.baseline).all(axis=0)
+        near_enough = (depth < FARTHEST * self.baseline).all(axis=0)
+        return np.ascontiguousarray(points.T), fixed & far_enough & near_enough
+
 
 def triangulate(rig: StereoRig, uv: Array) -> Array:
     """Least squares of eq. 2.3 by eq. 2.26.
@@ -135,7 +157,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
     PointError
         Rays that meet at infinity, at a camera or behind one: zero or negative disparity. See :func:`triangulable`.
     """
-    points, good = _points(rig, arrays.checked_rows("uv", uv, 4))
+    points, good = rig.intersections(arrays.checked_rows("uv", uv, 4))
     if not good.all():
         k = int(np.argmin(good))
         raise PointError(
@@ -148,37 +170,7 @@ def triangulate(rig: StereoRig, uv: Array) -> Array:
 
 def triangulable(rig: StereoRig, uv: Array) -> Array:
     """(N, 4) px to (N,) bool: the matches that :func:`triangulate` gives a point in front of both cameras."""
-    return _points(rig, arrays.checked_rows("uv", uv, 4))[1]
-
-
-def solved(rig: StereoRig, uv: Array) -> tuple[Array, Array, Array]:
-    """A (N, 4, 3) and b (N, 4) of eq. 2.3, rows in the order u, v, u', v', and the points (N, 3); or PointError."""
-    A, b = _system(rig, uv)
-    return np.moveaxis(A, -1, 0), b.T, triangulate(rig, uv)
-
-
-def _points(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
-    """Points (N, 3), and which of them are in front of both cameras (N,)."""
-    A, b = _system(rig, uv)
-    AtA = np.einsum("kin,kjn->ijn", A, A)
-    inverse, definite = arrays.symmetric_inverses(np.moveaxis(AtA, -1, 0))
-    inverse = np.moveaxis(inverse, 0, -1)
-    alone = np.einsum("iin,iin->in", inverse, AtA)
-    fixed = definite & (alone < 1.0 / FIXED).all(axis=0)
-    points = np.einsum("ijn,jn->in", inverse, np.einsum("kin,kn->in", A, b))
-    depth = rig.cameras[:, 2, :3] @ points + rig.cameras[:, 2, 3:]
-    far_enough = (depth > NEAREST * rig.baseline).all(axis=0)
-    near_enough = (depth < FARTHEST * rig.baseline).all(axis=0)
-    return np.ascontiguousarray(points.T), fixed & far_enough & near_enough
-
-
-def _system(rig: StereoRig, uv: Array) -> tuple[Array, Array]:
-    """A (4, 3, N) and b (4, N): the points last, so that sums run along memory."""
-    rows = rig.cameras[:, :2].reshape(4, 4, 1)
-    last = rig.cameras[:, 2].repeat(2, axis=0)[:, :, None]
-    A = uv.T[:, None] * last[:, :3]
-    A -= rows[:, :3]
-    return A, rows[:, 3] - uv.T * last[:, 3]
+    return rig.intersections(arrays.checked_rows("uv", uv, 4))[1]
 
 
 def is_rectified(rig: StereoRig) -> bool:

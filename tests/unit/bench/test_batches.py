@@ -10,6 +10,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from misbehaving import Deadly, Still
 
 import consistency as cs
 from consistency.bench.runs import workers
-from consistency.bench.runs.backends.choose_executor import executor_for
+from consistency.bench.runs.executors import executor_for
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.run_outcome import Recorded, RunOutcome, Simulated, TrialWork
 from consistency.bench.runs.workers import BatchResult, ExecutorWorkers, LocalThreads, do_batch, failed
@@ -77,13 +78,16 @@ class Fake(Executor):
         return result(runs, **self.changes)
 
     def outcomes(self, work):
-        def next_of(finished):
-            if finished.empty():
-                self.work()
-            return finished.get(timeout=5.0)
+        executor = self
+
+        class Finished(SimpleQueue):
+            def get(self, *_, **__):
+                if self.empty():
+                    executor.work()
+                return super().get(timeout=5.0)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(workers, "_next_of", next_of)
+            patch.setattr(workers, "SimpleQueue", Finished)
             yield from ExecutorWorkers(self).outcomes(work, range(RUNS))
 
 
@@ -361,6 +365,6 @@ def test_a_backend_is_chosen_by_name():
 
 def test_without_the_extra_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.delitem(sys.modules, "consistency.bench.runs.backends.dask", raising=False)
+    monkeypatch.delitem(sys.modules, "consistency.bench.runs.dask_executor", raising=False)
     with pytest.raises(cs.InputError, match="needs distributed: pip install "), executor_for("dask"):
         pass

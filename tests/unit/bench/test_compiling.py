@@ -1,6 +1,7 @@
 """Kernels compiled side by side: nothing is left behind, whoever is killed, and what is not kept is compiled here."""
 
 import os
+import pickle
 import signal
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 import forks
 import pytest
 
+from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import jit
 from consistency.bench.filters.compiler.jit import Content, Kernel, Outlook
 from consistency.bench.filters.run_filter import resolve_filters
@@ -180,11 +182,21 @@ def test_kernels_of_root_serve_other_users(done, folder, monkeypatch):
 
 def test_what_others_cannot_read_is_compiled_here(capsys):
     made = []
-    outlook = Outlook("", is_ready=False, is_shared=False, size=4)
-    mine = SimpleNamespace(name="mine", compile=lambda *_: made.append(1))
-    need = run_outcome.Need(mine, None, None, outlook)  # type: ignore[arg-type]
-    run_outcome._compile([need, need], 2)
-    assert made == [1, 1]
+
+    class Mine(Compiled):
+        name = "mine"
+
+        def __init__(self, key):
+            self.key = key
+
+        def outlook(self, *_):
+            return Outlook(self.key, is_ready=False, is_shared=False, size=4)
+
+        def compile(self, *_):
+            made.append(self.key)
+
+    run_outcome.compile_all([(Mine("a"), None, None), (Mine("b"), None, None)], 2)  # type: ignore[arg-type]
+    assert made == ["a", "b"]
     assert capsys.readouterr().err == "compiling 2 kernels of mine, once: 10 to 60 s for each\n"
 
 
@@ -230,8 +242,8 @@ def test_the_largest_kernel_is_compiled_first(monkeypatch):
     class Pool:
         def __init__(self, *_, **__): ...
 
-        def submit(self, _, size):
-            begun.append(size)
+        def submit(self, _, need):
+            begun.append(pickle.loads(need)[0])
             done = Future()
             done.set_result(None)
             return done
@@ -239,10 +251,9 @@ def test_the_largest_kernel_is_compiled_first(monkeypatch):
         def shutdown(self, **_): ...
 
     monkeypatch.setattr(run_outcome, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(run_outcome, "_pickled", lambda need: need.outlook.size)
-    needs = [SimpleNamespace(outlook=Outlook("", False, True, size)) for size in (2, 3, 1)]
+    needs = [run_outcome.Need(f"of {size}", None, None, Outlook("", False, True, size)) for size in (2, 3, 1)]
     run_outcome._compile_side_by_side(needs, 2)
-    assert begun == [3, 2, 1]
+    assert begun == ["of 3", "of 2", "of 1"]
 
 
 # --- before what takes long -------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from cluster import Cluster, free_port
 from misbehaving import KINDS, Deadly, Still
 
 import consistency as cs
-from consistency.bench.runs.backends.dask import Client, DaskExecutor
+from consistency.bench.runs.dask_executor import Client, DaskExecutor
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.run_outcome import Simulated, TrialWork

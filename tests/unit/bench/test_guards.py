@@ -12,7 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.filters.filter_declarations import optimal_gain
-from consistency.bench.filters.guard.guarded import Guarded
+from consistency.bench.filters.guard import Guarded
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import build_report

@@ -23,8 +23,7 @@ import consistency as cs
 from consistency.bench.filters.run_filter import run_filter
 from consistency.bench.runs import isolation as filter_process
 from consistency.bench.runs.isolation import Isolation
-from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.runs.outcomes_to_results import Gathered, Interrupted
 from consistency.bench.runs.run_outcome import outcome_of
 from consistency.bench.store.journal import IN_MEMORY, Journal
 

@@ -18,8 +18,7 @@ from edited import accept_changes, change_manifest, content
 
 import consistency as cs
 from consistency.bench.runs import outcomes_to_results
-from consistency.bench.runs.montecarlo import Interrupted
-from consistency.bench.runs.outcomes_to_results import Gathered
+from consistency.bench.runs.outcomes_to_results import Gathered, Interrupted
 from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import DATABASE, Journal, Unfinished

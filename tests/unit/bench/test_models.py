@@ -11,7 +11,7 @@ from consistency.bench.filters.kernel.part_functions import State
 from consistency.bench.filters.kernel.update_steps import (
     linearise,
     linearise_at,
-    make_work,
+    make_scratch,
     observe,
     place_observed,
 )
@@ -181,7 +181,7 @@ def test_kernels_equal_the_textbook_sensor(pose, landmark, uvd, tilted):
     assert close(z, expected)
     for kernel, textbook in zip((Hp, Hl), sensor.jacobians(pose, landmark), strict=True):
         assert close(kernel, textbook)
-    where, work = np.empty(3), make_work(slam, 6, 1, 1, 1)
+    where, work = np.empty(3), make_scratch(slam, 6, 1, 1, 1)
     place_observed(slam, pose, expected, where, work)
     for kernel, textbook in zip((where, work.Jp, work.Jz), sensor.locate(pose, expected), strict=True):
         assert close(kernel, textbook)
@@ -195,7 +195,7 @@ def test_linear_kernel_is_the_first_order_expansion(tilted):
     slam = _slam(belief, uvd=False)._replace(point=reference)
     Hp0, Hl0 = sensor.jacobians(pose0, landmark0)
     step, move = np.array([0.4, -0.3, 0.5]), np.array([0.2, 0.6, -0.1])
-    z, Hp, Hl, work = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), make_work(slam, 6, 1, 1, 1)
+    z, Hp, Hl, work = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), make_scratch(slam, 6, 1, 1, 1)
     linearise(slam, pose0 + step, landmark0 + move, 0, 0, z, Hp, Hl, work)
     assert close(Hp, Hp0)
     assert close(Hl, Hl0)

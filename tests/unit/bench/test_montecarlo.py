@@ -10,7 +10,7 @@ from misbehaving import Still
 
 import consistency as cs
 from consistency.bench.filters.run_filter import run_filter
-from consistency.bench.runs.montecarlo import Interrupted
+from consistency.bench.runs.outcomes_to_results import Interrupted
 from consistency.bench.types import Trial
 
 

@@ -6,11 +6,11 @@ import pytest
 from misbehaving import Deadly, is_gone
 
 import consistency as cs
-from consistency.bench.runs.backends import slurm
-from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
+from consistency.bench.runs import slurm_executor as slurm
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.run_outcome import Simulated, TrialWork
+from consistency.bench.runs.slurm_executor import SlurmExecutor, options_of
 from consistency.bench.runs.workers import ExecutorWorkers, LocalThreads
 
 pytestmark = [

@@ -13,8 +13,8 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
 from consistency.referee.pages.write_pages import facts
-from consistency.stereo.visual_odometry import common_motion
-from consistency.stereo.visual_odometry.common_motion import screened, screened_log, screening_line
+from consistency.stereo.visual_odometry import tracks
+from consistency.stereo.visual_odometry.tracks import screened, screened_log, screening_line
 
 STEPS, COUNT = 12, 14
 MOTION = BelievedMotion(sigma_v=0.1, sigma_omega=0.02)
@@ -98,18 +98,18 @@ def test_the_derivative_of_what_is_expected(model):
     sensor, rng = SENSORS[model], np.random.default_rng(77)
     points = np.column_stack([rng.uniform(6, 14, 5), rng.uniform(-4, 4, 5), rng.uniform(-1, 1, 5)])
     move = np.array([0.1, -0.05, 0.02, 0.0, 0.0, 0.0])
-    seen, _ = common_motion._expected(points, sensor)
-    _, slope = common_motion._error_and_slope(points, seen, move, sensor)
+    seen, _ = tracks._expected(points, sensor)
+    _, slope = tracks._error_and_slope(points, seen, move, sensor)
     for i, step in enumerate(1e-6 * np.eye(6)):
-        ends = [common_motion._error_and_slope(points, seen, move + s * step, sensor)[0] for s in (1, -1)]
+        ends = [tracks._error_and_slope(points, seen, move + s * step, sensor)[0] for s in (1, -1)]
         assert_allclose(slope[:, :, i], (ends[1] - ends[0]) / 2e-6, rtol=1e-5, atol=1e-5)
 
 
 def test_a_bearing_may_cross_half_a_turn():
     sensor, points = SENSORS["range-bearing"], np.array([[8.0, 1.0, 0.0], [9.0, -1.0, 0.0]])
-    seen, _ = common_motion._expected(points, sensor)
+    seen, _ = tracks._expected(points, sensor)
     beyond = seen + np.array([0.0, 2.0 * np.pi])
-    error, _ = common_motion._error_and_slope(points, beyond, np.zeros(6), sensor)
+    error, _ = tracks._error_and_slope(points, beyond, np.zeros(6), sensor)
     assert_allclose(error, 0.0, atol=1e-12)
 
 

@@ -7,8 +7,14 @@ from numpy.testing import assert_allclose
 import consistency as cs
 from consistency.stereo.visual_odometry.arrays import MatchError
 from consistency.stereo.visual_odometry.odometry import bridged
-from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, estimate_motion
-from consistency.stereo.visual_odometry.resection import inliers_within, resect_ransac, squared_reprojections
+from consistency.stereo.visual_odometry.relative_motion import (
+    MotionSettings,
+    RelativeMotion,
+    estimate_motion,
+    inliers_within,
+    resect_ransac,
+    squared_reprojections,
+)
 from consistency.vision import ConsensusError, RelativePose, StereoRig, register_ransac, triangulate
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")

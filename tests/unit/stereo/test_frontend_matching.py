@@ -113,14 +113,16 @@ def test_a_circle_must_close(rng):
     uv = np.zeros((20, 2))
     same = features(uv, descriptors)
     pairs = np.column_stack([np.arange(20)] * 2)
-    before = StereoFeatures(same, same, pairs)
+    before = StereoFeatures(RECTIFIED, same, same, pairs)
     order = rng.permutation(20)
-    after = StereoFeatures(features(uv, descriptors[order]), features(uv, descriptors[order]), pairs)
+    after = StereoFeatures(RECTIFIED, features(uv, descriptors[order]), features(uv, descriptors[order]), pairs)
     closed = circular_matches(before, after)
     assert_array_equal(closed, np.column_stack([np.arange(20), np.argsort(order)]))
-    crossed = StereoFeatures(after.left, after.right, np.column_stack([np.arange(20), np.roll(np.arange(20), 1)]))
+    crossed = StereoFeatures(
+        RECTIFIED, after.left, after.right, np.column_stack([np.arange(20), np.roll(np.arange(20), 1)])
+    )
     assert len(circular_matches(before, crossed)) == 0
-    none = StereoFeatures(same, same, pairs[:0])
+    none = StereoFeatures(RECTIFIED, same, same, pairs[:0])
     assert circular_matches(before, none).shape == circular_matches(none, before).shape == (0, 2)
 
 

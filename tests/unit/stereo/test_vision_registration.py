@@ -9,8 +9,8 @@ from rigs import MOTION
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry import registration
-from consistency.stereo.visual_odometry.registration import squared_distances
+from consistency.stereo.visual_odometry import relative_pose
+from consistency.stereo.visual_odometry.relative_pose import squared_distances
 from consistency.vision import (
     ConsensusError,
     ConvergenceError,
@@ -186,9 +186,9 @@ def test_all_inliers_know_more_than_three(rng, monkeypatch):
         p2 = scene(rng, 300)
         p1 = MOTION.apply(p2) + rng.normal(0, 0.05, (300, 3))
         counts = []
-        for refits in (registration.REFITS, 0):
+        for refits in (relative_pose.REFITS, 0):
             with monkeypatch.context() as patch:
-                patch.setattr(registration, "REFITS", refits)
+                patch.setattr(relative_pose, "REFITS", refits)
                 same = np.random.default_rng(7)
                 counts.append(int(register_ransac(p1, p2, threshold=0.08, rng=same)[1].sum()))
         gained.append(counts[0] - counts[1])
@@ -198,17 +198,17 @@ def test_all_inliers_know_more_than_three(rng, monkeypatch):
 def test_few_inliers_take_many_draws(rng, monkeypatch):
     """20 % inliers: one draw in 125 has three, and log(0.001) / log(1 - 0.2^3) = 861 draws are 14 rounds of 64."""
     rounds = []
-    motions = registration.rigid_motions
+    motions = relative_pose.rigid_motions
 
     def counted(*points):
         rounds.append(len(points[0]))
         return motions(*points)
 
-    monkeypatch.setattr(registration, "rigid_motions", counted)
+    monkeypatch.setattr(relative_pose, "rigid_motions", counted)
     p2 = scene(rng, 100)
     p1 = np.where(np.arange(100)[:, None] < 20, MOTION.apply(p2), scene(rng, 100))
     register_ransac(p1, p2, threshold=1e-3, rng=rng)
-    assert rounds.count(registration.ROUND) >= 14
+    assert rounds.count(relative_pose.ROUND) >= 14
 
 
 def test_points_of_a_line_agree_on_no_motion(rng):

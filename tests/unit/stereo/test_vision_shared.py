@@ -11,10 +11,16 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.diagnostics.questions.uncertain_truth import posterior
 from consistency.referee.errors import InputError
-from consistency.stereo.visual_odometry.odometry import bridged
-from consistency.stereo.visual_odometry.relative_motion import RelativeMotion
-from consistency.stereo.visual_odometry.resection import diagonal_covariances
-from consistency.stereo.visual_odometry.shared import RIG, SHARED, SharedError, fit_shared, perturbed, sensitivities
+from consistency.stereo.visual_odometry.odometry import (
+    RIG,
+    SHARED,
+    SharedError,
+    bridged,
+    fit_shared,
+    perturbed,
+    sensitivities,
+)
+from consistency.stereo.visual_odometry.relative_motion import RelativeMotion, diagonal_covariances
 from consistency.vision import RelativePose, StereoRig, refine_reprojection
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])

@@ -30,8 +30,8 @@ from consistency.bench.filters.kernel.part_functions import (
     held_at,
     insert_error,
     landmark_width,
-    make_local,
-    make_watch,
+    make_covariance_arrays,
+    make_guard_arrays,
     may_enter,
     observed_width,
     place,
@@ -46,7 +46,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     world_point,
 )
-from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Work, begin_landmark, make_work
+from consistency.bench.filters.kernel.update_steps import NOT_FINITE, POSE, Scratch, begin_landmark, make_scratch
 from consistency.referee.types import Array, Indices
 
 
@@ -68,20 +68,26 @@ class Outcome(NamedTuple):
 
 
 @inner
-def _find_known(data: Data, k: int, offset: Indices, work: Work[NamedTuple]) -> int:
+def _find_known(data: Data, k: int, offset: Indices, scratch: Scratch[NamedTuple]) -> int:
     """Observations of step k + 1 whose landmark is in the state, their offsets, and how many they are."""
     m = 0
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
         if offset[label] >= 0:
-            work.known[m], work.label[m], work.at[m] = i, label, offset[label]
+            scratch.known[m], scratch.label[m], scratch.at[m] = i, label, offset[label]
             m += 1
     return m
 
 
 @inner
 def _insert_new(
-    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    of_covariance: NamedTuple,
+    scratch: Scratch[NamedTuple],
+    of_guard: NamedTuple,
 ) -> State:
     """The state with the landmarks that begin in step k + 1: at its end, or again at their place."""
     w = landmark_width(slam.landmark)
@@ -89,34 +95,40 @@ def _insert_new(
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
         o = offset[label]
-        if may_enter(slam.guard, i, o >= 0, watch):
+        if may_enter(slam.guard, i, o >= 0, of_guard):
             if o < 0:
                 o = offset[label] = n if o == -1 else -1 - o
                 n = max(n, o + w)
-            place(slam.point, slam, State(x, P, o, base, offset), k, label, data.z[i], work)
-            insert_error(slam.error, x[:3], x[o : o + w], work.Jp)
-            append(slam.covariance, slam, State(x, P, n, base, offset), label, local, work)
-            begin_landmark(P, n, o, work.Jp, work.Jz, data.R[i])
+            place(slam.point, slam, State(x, P, o, base, offset), k, label, data.z[i], scratch)
+            insert_error(slam.error, x[:3], x[o : o + w], scratch.Jp)
+            append(slam.covariance, slam, State(x, P, n, base, offset), label, of_covariance, scratch)
+            begin_landmark(P, n, o, scratch.Jp, scratch.Jz, data.R[i])
     return State(x, P, n, base, offset)
 
 
 @inner
 def _step(
-    slam: Slam, state: State, data: Data, k: int, local: NamedTuple, work: Work[NamedTuple], watch: NamedTuple
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    of_covariance: NamedTuple,
+    scratch: Scratch[NamedTuple],
+    of_guard: NamedTuple,
 ) -> tuple[State, int, int, float, float]:
     """Step k + 1: the state after it, a code of REASONS or 0, the landmarks in the update, the NIS, and log det S."""
-    predict(slam.update, slam, state, k, data.controls[k], local, work)
-    m, nis, log_det = _find_known(data, k, state.offset, work), np.nan, np.nan
-    code, m, has_innovation = screen(slam.guard, slam, state, data, k, m, local, work, watch)
+    predict(slam.update, slam, state, k, data.controls[k], of_covariance, scratch)
+    m, nis, log_det = _find_known(data, k, state.offset, scratch), np.nan, np.nan
+    code, m, has_innovation = screen(slam.guard, slam, state, data, k, m, of_covariance, scratch, of_guard)
     if code > 0:
         return state, code, 0, nis, log_det
     if m > 0:
-        work.used[0] = m
-        code, nis, log_det = correct(slam.update, slam, state, data, k, m, has_innovation, local, work)
-        m = work.used[0]
+        scratch.used[0] = m
+        code, nis, log_det = correct(slam.update, slam, state, data, k, m, has_innovation, of_covariance, scratch)
+        m = scratch.used[0]
         if code > 0:
             return state, code, 0, nis, log_det
-    state = _insert_new(slam, state, data, k, local, work, watch)
+    state = _insert_new(slam, state, data, k, of_covariance, scratch, of_guard)
     return state, 0 if np.isfinite(sum_of(state.x[: state.n])) else NOT_FINITE, m, nis, log_det
 
 
@@ -130,7 +142,7 @@ def _most_seen(first: Indices) -> int:
 
 
 @inner
-def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Array) -> Array:
+def _map(slam: Slam, state: State, of_covariance: NamedTuple, points: Array, spread: Array) -> Array:
     """``points``, ``spread`` <- the landmarks in the world, as ``Outcome`` has them; returns its ``joint``, D P D'."""
     w, P = landmark_width(slam.landmark), state.P
     width, count = 3 + w, 1
@@ -145,7 +157,7 @@ def _map(slam: Slam, state: State, local: NamedTuple, points: Array, spread: Arr
         o = state.offset[label]
         if o >= 0:
             i += 1
-            pose_at, own = held_at(slam.covariance, label, local), at[width * i : width * i + width]
+            pose_at, own = held_at(slam.covariance, label, of_covariance), at[width * i : width * i + width]
             pose, values = state.x[pose_at : pose_at + 3], state.x[o : o + w]
             world_point(slam.landmark, robot_frame(pose), values, points[label], D[i, :, :3], D[i, :, 3:])
             to_error(slam.error, pose, values, D[i, :, :3], D[i, :, 3:])
@@ -217,7 +229,7 @@ def _empty_outcome(T: int, n_landmarks: int) -> Outcome:
 
 
 @inner
-def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedTuple]) -> int:
+def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, scratch: Scratch[NamedTuple]) -> int:
     """Estimate of step k + 1; returns the rank of its own covariance as ``definiteness`` says it.
 
     -1 too where the covariance of the additive error has lost its rank to rounding.
@@ -225,8 +237,8 @@ def _keep_pose(slam: Slam, state: State, k: int, out: Outcome, work: Work[NamedT
     copy_matrix(state.P[:3, :3], out.own[k])
     copy(state.x[:3], out.pose[k])
     pose_covariance(slam.error, out.pose[k], out.own[k], out.covariance[k])
-    rank = definiteness_with(out.own[k], work.small)
-    return -1 if rank == 1 and definiteness_with(out.covariance[k], work.small) < 1 else rank
+    rank = definiteness_with(out.own[k], scratch.small)
+    return -1 if rank == 1 and definiteness_with(out.covariance[k], scratch.small) < 1 else rank
 
 
 @inner
@@ -256,28 +268,28 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
     size += spare_width(slam.covariance, T, data.n_landmarks)
     labels, most = data.n_landmarks, _most_seen(data.first)
     own_memory = Memory(filled(size, 0.0), filled_matrix(size, size, 0.0), integers(labels, -1), integers(labels, -1))
-    own_out, own_work = _empty_outcome(T, labels), make_work(slam, size, most, T, labels)
-    own_local = make_local(slam.covariance, w, size, T, labels)
-    own_watch = make_watch(slam.guard, observed_width(slam.sensor), most, len(data.landmark), labels)
-    memory, work, local, out = (
+    own_out, own_scratch = _empty_outcome(T, labels), make_scratch(slam, size, most, T, labels)
+    own_covariance_arrays = make_covariance_arrays(slam.covariance, w, size, T, labels)
+    own_guard_arrays = make_guard_arrays(slam.guard, observed_width(slam.sensor), most, len(data.landmark), labels)
+    memory, scratch, of_covariance, out = (
         by_reference(own_memory),
-        by_reference(own_work),
-        by_reference(own_local),
+        by_reference(own_scratch),
+        by_reference(own_covariance_arrays),
         by_reference(own_out),
     )
-    watch = by_reference(own_watch)
+    of_guard = by_reference(own_guard_arrays)
     copy(data.start, memory.x[:3])
     whole = State(memory.x, memory.P, 3, 0, memory.home)
     state = State(memory.x, memory.P, 3, 0, memory.active)  # of a step: the whole, unless it has a base
     full_rank, step, code = False, 0, 0
     for k in range(T):
         seen = data.landmark[data.first[k] : data.first[k + 1]]
-        whole, state = prepare(slam.covariance, slam, whole, state, seen, local)
-        state, code, m, nis, log_det = _step(slam, state, data, k, local, work, watch)
+        whole, state = prepare(slam.covariance, slam, whole, state, seen, of_covariance)
+        state, code, m, nis, log_det = _step(slam, state, data, k, of_covariance, scratch, of_guard)
         if m > 0:
             out.nis[k], out.nis_dof[k], out.log_det[k] = nis, observed_width(slam.sensor) * m, log_det
         if code == 0:
-            rank = _keep_pose(slam, state, k, out, work)
+            rank = _keep_pose(slam, state, k, out, scratch)
             if rank < 0 or (full_rank and rank == 0):
                 code = POSE
                 fill(out.pose[k], np.nan)
@@ -289,12 +301,12 @@ def run_trial(own_slam: Slam, own_data: Data, size: int) -> Outcome:
             break
         whole = State(memory.x, memory.P, _settle_new(seen, whole.n, w, state, memory.home), 0, memory.home)
     if code == 0:
-        settle(slam.covariance, slam, whole, state, local)
-        joint = _map(slam, whole, local, out.points, out.spread)
+        settle(slam.covariance, slam, whole, state, of_covariance)
+        joint = _map(slam, whole, of_covariance, out.points, out.spread)
     else:
         joint = matrix(0, 0)
-    rejected = rejected_rows(slam.guard, own_watch)
-    keep((own_slam, own_data, own_memory, own_work, own_local, own_watch))
+    rejected = rejected_rows(slam.guard, own_guard_arrays)
+    keep((own_slam, own_data, own_memory, own_scratch, own_covariance_arrays, own_guard_arrays))
     return Outcome(
         own_out.pose, own_out.covariance, own_out.own, own_out.nis, own_out.nis_dof, own_out.log_det, step, code,
         own_out.points, own_out.spread, joint, rejected,

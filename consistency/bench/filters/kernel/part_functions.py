@@ -211,7 +211,7 @@ def combine(landmark: NamedTuple, Hp: Array, Hl: Array, rows: Array, i: int, out
 
 
 @generic(default=True)
-def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Any) -> None:
+def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Any) -> None:
     """x (n,), P (n, n), Phi (n, base) <- one step of motion under the control ``u`` (3,), to step k + 1.
 
     The Jacobians are taken where the linearisation point asks for them. By default they are
@@ -219,7 +219,7 @@ def propagate(error: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi
     """
     pose = state.x[:3]
     at = motion_point(slam.point, pose, k)
-    propagate_covariance_at(slam.point, slam, state, k, u, Phi, work)
+    propagate_covariance_at(slam.point, slam, state, k, u, Phi, scratch)
     add_motion_noise(slam.motion, at, u, state.P)
     if expands(slam.point):
         move_about(at, u, pose)
@@ -244,7 +244,7 @@ def insert_error(error: NamedTuple, pose: Array, values: Array, Jp: Array) -> No
 
 
 @generic(default=True)
-def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, work: Any) -> None:
+def retract(error: NamedTuple, slam: Slam, state: State, A: Array, y: Array, scratch: Any) -> None:
     """x (n,) <- x moved by the error A' y, with A (k, n) and y (k,).
 
     By default by a sum.
@@ -277,8 +277,8 @@ def stands_apart(point: NamedTuple) -> bool:
 
 
 @generic(default=True)
-def make_notes(point: NamedTuple, w: int, steps: int, labels: int) -> Any:
-    """What the point remembers of a trial of so many steps and ids of landmarks, ``work.notes``; made once."""
+def make_point_arrays(point: NamedTuple, w: int, steps: int, labels: int) -> Any:
+    """What the point remembers of a trial of so many steps and ids of landmarks, ``scratch.of_point``; made once."""
     return ()
 
 
@@ -290,7 +290,7 @@ def motion_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 @generic(default=True)
 def propagate_covariance_at(
-    point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Any
+    point: NamedTuple, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Any
 ) -> None:
     """:func:`propagate_covariance` of P (n, n) and Phi (n, base), with F of step k + 1 as the point asks.
 
@@ -306,41 +306,41 @@ def observation_point(point: NamedTuple, pose: Array, k: int) -> Array:
 
 
 @generic(default=True)
-def landmark_point(point: NamedTuple, values: Array, label: int, work: Any) -> Array:
+def landmark_point(point: NamedTuple, values: Array, label: int, scratch: Any) -> Array:
     """Landmark (w,) at which h is linearised; ``values`` (w,) is the estimate of landmark ``label``."""
     return values
 
 
 @generic()
-def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, work: Any) -> None:
-    """x[n:n + w], ``work.Jp`` (w, 3), ``work.Jz`` (w, s) <- a new landmark from its observation z (s,); Jacobians."""
+def place(point: NamedTuple, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Any) -> None:
+    """x[n:n + w] <- a new landmark from its observation z (s,); ``scratch.Jp`` (w, 3), ``Jz`` (w, s) <- Jacobians."""
 
 
 # --- update ----------------------------------------------------------------------------------------
 
 
 @generic(default=True)
-def make_room(update: NamedTuple, w: int, s: int, m: int, n: int) -> Any:
+def make_update_arrays(update: NamedTuple, w: int, s: int, m: int, n: int) -> Any:
     """Arrays of this update for up to ``m`` landmarks in a step and a state of up to ``n`` variables."""
     return ()
 
 
 @generic(default=True)
-def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, local: Any, work: Any) -> None:
-    """x (n,), P (n, n), and what ``local`` says of them <- one step of motion under the control ``u`` (3,).
+def predict(update: NamedTuple, slam: Slam, state: State, k: int, u: Array, of_covariance: Any, scratch: Any) -> None:
+    """x (n,), P (n, n), and what ``of_covariance`` says of them <- one step of motion under the control ``u`` (3,).
 
     By default as ``error`` has it.
     """
-    propagate(slam.error, slam, state, k, u, local.Phi, work)
+    propagate(slam.error, slam, state, k, u, of_covariance.Phi, scratch)
 
 
 @generic()
 def predict_innovation(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Any, work: Any
+    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, of_covariance: Any, scratch: Any
 ) -> tuple[int, float]:
-    """Upper half of ``work.S`` (s m, s m) <- innovation covariance; column n + base of ``work.A`` <- innovation (s m,).
+    """Upper half of ``scratch.S`` (s m, s m) <- innovation covariance; column n + base of ``A`` <- innovation (s m,).
 
-    They are those of an update in step k + 1 with the ``m`` landmarks that ``work`` lists, as ``Info`` has them; the
+    They are those of an update in step k + 1 with the ``m`` landmarks that ``scratch`` lists, as ``Info`` has them; the
     state stays as it is. Returns a code of REASONS, 0 where all is well, and a sum that is finite if all is.
     """
 
@@ -354,10 +354,10 @@ def correct(
     k: int,
     m: int,
     has_innovation: bool,
-    local: Any,
-    work: Any,
+    of_covariance: Any,
+    scratch: Any,
 ) -> tuple[int, float, float]:
-    """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``work`` lists.
+    """x (n,), P (n, n) <- the joint update in step k + 1 with the ``m`` landmarks that ``scratch`` lists.
 
     ``has_innovation`` says whether :func:`predict_innovation` has been called for these, and nothing since. Returns
     a code of REASONS, 0 where all is well, the NIS, and log det S of that innovation.
@@ -365,10 +365,10 @@ def correct(
 
 
 @generic()
-def innovate_again(update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, work: Any) -> bool:
+def innovate_again(update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, scratch: Any) -> bool:
     """A, S without noise, and the innovation about x, for an update that iterates; False where the prior is indefinite.
 
-    From the innovation is taken what the linearisation makes of the way from x to ``work.prior`` (3 + w m,).
+    From the innovation is taken what the linearisation makes of the way from x to ``scratch.prior`` (3 + w m,).
     """
 
 
@@ -376,7 +376,7 @@ def innovate_again(update: NamedTuple, slam: Slam, state: State, data: Data, k: 
 
 
 @generic(default=True)
-def make_watch(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int) -> Any:
+def make_guard_arrays(guard: NamedTuple, s: int, m: int, rows: int, n_landmarks: int) -> Any:
     """What a guard keeps of a trial with so many ``rows`` of observations, up to ``m`` in a step; made once."""
     return ()
 
@@ -389,11 +389,11 @@ def screen(
     data: Data,
     k: int,
     m: int,
-    local: Any,
-    work: Any,
-    watch: Any,
+    of_covariance: Any,
+    scratch: Any,
+    of_guard: Any,
 ) -> tuple[int, int, bool]:
-    """``work`` lists, of the ``m`` known landmarks of step k + 1, those that the guard keeps; ``watch`` has the others.
+    """``scratch`` lists, of the ``m`` known landmarks of step k + 1, what the guard keeps; ``of_guard`` has the others.
 
     Returns a code of REASONS, 0 where all is well, how many are left, and whether they are foreseen. By default all are
     left.
@@ -402,13 +402,13 @@ def screen(
 
 
 @generic(default=True)
-def may_enter(guard: NamedTuple, row: int, is_known: bool, watch: Any) -> bool:
+def may_enter(guard: NamedTuple, row: int, is_known: bool, of_guard: Any) -> bool:
     """Whether a landmark begins with the observation in this row of the data; again, if it is in the state."""
     return not is_known
 
 
 @generic(default=True)
-def rejected_rows(guard: NamedTuple, watch: Any) -> Array:
+def rejected_rows(guard: NamedTuple, of_guard: Any) -> Array:
     """Which rows of the data the filter was not given, (M,), or nothing, (0,), of a filter without a guard."""
     return np.empty(0, np.bool_)
 
@@ -423,14 +423,14 @@ def spare_width(covariance: NamedTuple, steps: int, n_landmarks: int) -> int:
 
 
 @generic(default=True)
-def make_local(covariance: NamedTuple, w: int, n: int, steps: int, n_landmarks: int) -> Any:
+def make_covariance_arrays(covariance: NamedTuple, w: int, n: int, steps: int, n_landmarks: int) -> Any:
     """What this covariance update keeps beside a state of up to ``n`` variables."""
     return make_factors(3, 3, 1)
 
 
 @generic(default=True)
 def prepare(
-    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, local: Any
+    covariance: NamedTuple, slam: Slam, whole: State, state: State, labels: Indices, of_covariance: Any
 ) -> tuple[State, State]:
     """The whole state, and the variables to work on in a step that sees the landmarks ``labels`` (m,): all, or a part.
 
@@ -440,26 +440,26 @@ def prepare(
 
 
 @generic(default=True)
-def append(covariance: NamedTuple, slam: Slam, state: State, label: int, local: Any, work: Any) -> None:
-    """``local`` <- a landmark that begins at its offset in ``state``, with Jacobian ``work.Jp`` (w, 3)."""
+def append(covariance: NamedTuple, slam: Slam, state: State, label: int, of_covariance: Any, scratch: Any) -> None:
+    """``of_covariance`` <- a landmark that begins at its offset in ``state``, with Jacobian ``scratch.Jp`` (w, 3)."""
 
 
 @generic(default=True)
-def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, local: Any) -> None:
+def settle(covariance: NamedTuple, slam: Slam, whole: State, state: State, of_covariance: Any) -> None:
     """``whole`` <- all variables as they are after the steps so far, those outside the active part included."""
 
 
 @generic(default=True)
-def held_at(covariance: NamedTuple, label: int, local: Any) -> int:
+def held_at(covariance: NamedTuple, label: int, of_covariance: Any) -> int:
     """Offset of the pose in whose frame a landmark is; 0 is the robot's."""
     return 0
 
 
 @generic(default=True)
 def withhold(
-    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, again: Array, local: Any
+    covariance: NamedTuple, state: State, data: Data, k: int, rejected: Array, again: Array, of_covariance: Any
 ) -> None:
-    """``local`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen.
+    """``of_covariance`` <- as if the rows of step k + 1 that are ``rejected`` (M,) had not been seen.
 
     The landmarks of the rows ``again`` (M,), which are among these, are forgotten: they are about to restart.
     """

@@ -1,7 +1,7 @@
 """Steps of all updates: to the observation and back, and the correction with W = S^-1/2 Cov(z, x).
 
 The correction is eq. 11 and 12 of Herath, Kodagoda & Dissanayake (2007). The covariance of the state is row-major, its
-upper half valid. Steps write to the work arrays of a trial, which are made once: no step allocates.
+upper half valid. Steps write to the scratch arrays of a trial, which are made once: no step allocates.
 
 A symmetric update of half of P costs half, and BLAS leaves the other half alone. Everything that reads or
 writes P does it here, but for the block and the rows of the robot, which are whole.
@@ -44,8 +44,8 @@ from consistency.bench.filters.kernel.part_functions import (
     landmark_width,
     locate,
     locate_jacobian,
-    make_notes,
-    make_room,
+    make_point_arrays,
+    make_update_arrays,
     measure,
     measure_jacobian,
     observation_point,
@@ -62,7 +62,7 @@ from consistency.bench.filters.kernel.part_functions import (
 from consistency.bench.models import observation
 from consistency.referee.types import Array, Indices
 
-Room = TypeVar("Room", covariant=True)
+OfUpdate = TypeVar("OfUpdate", covariant=True)
 NOT_FINITE, INNOVATION, POSE = 1, 2, 3
 REASONS = {
     NOT_FINITE: "the estimate is not finite",
@@ -71,7 +71,7 @@ REASONS = {
 }
 
 
-class Work(NamedTuple, Generic[Room]):
+class Scratch(NamedTuple, Generic[OfUpdate]):
     """``m``: the most landmarks seen in a step, ``n``: final size of the state, ``L`` = 3 + w m, s: of ``measure``."""
 
     known: Indices  # (m,) rows of the observations whose landmark is in the state
@@ -92,16 +92,16 @@ class Work(NamedTuple, Generic[Room]):
     pose: Array  # (3,)
     prior: Array  # (L,) of the variables involved, for an update that iterates
     small: Array  # (3, 3)
-    room: Room  # what the update alone needs
-    notes: Any  # what the linearisation point alone needs, of a type of its own
+    of_update: OfUpdate  # what the update alone needs
+    of_point: Any  # what the linearisation point alone needs, of a type of its own
 
 
 @inner
-def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[NamedTuple]:
+def make_scratch(slam: Slam, n: int, m: int, steps: int, labels: int) -> Scratch[NamedTuple]:
     """Arrays for a state of up to ``n`` variables, ``m`` landmarks in a step, and a trial with so many labels."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     rows = s * m
-    return Work(
+    return Scratch(
         integers(m, 0),
         integers(m, 0),
         integers(m, 0),
@@ -120,8 +120,8 @@ def make_work(slam: Slam, n: int, m: int, steps: int, labels: int) -> Work[Named
         vector(3),
         vector(3 + w * m),
         matrix(3, 3),
-        make_room(slam.update, w, s, m, n),
-        make_notes(slam.point, w, steps, labels),
+        make_update_arrays(slam.update, w, s, m, n),
+        make_point_arrays(slam.point, w, steps, labels),
     )
 
 
@@ -157,10 +157,18 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
 
 @inner
 def linearise(
-    slam: Slam, pose: Array, values: Array, k: int, label: int, z: Array, Hp: Array, Hl: Array, work: Work[NamedTuple]
+    slam: Slam,
+    pose: Array,
+    values: Array,
+    k: int,
+    label: int,
+    z: Array,
+    Hp: Array,
+    Hl: Array,
+    scratch: Scratch[NamedTuple],
 ) -> None:
     """z (s,) <- h expected of pose (3,), values (w,) in step k + 1; Hp (s, 3), Hl (s, w) <- Jacobians at the point."""
-    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, work)
+    at, landmark = observation_point(slam.point, pose, k), landmark_point(slam.point, values, label, scratch)
     linearise_at(slam, robot_frame(at), landmark, z, Hp, Hl)
     if expands(slam.point):
         for i in range(observed_width(slam.sensor)):
@@ -171,9 +179,9 @@ def linearise(
 
 
 @inner
-def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[NamedTuple]) -> None:
-    """values (w,), ``work.Jp`` (w, 3), ``work.Jz`` (w, s) <- inverse of h at ``pose`` (3,) for z (s,); Jacobians."""
-    mount, Jb, s = slam.sensor.mount, work.Jb, observed_width(slam.sensor)
+def place_observed(slam: Slam, pose: Array, z: Array, values: Array, scratch: Scratch[NamedTuple]) -> None:
+    """values (w,) <- inverse of h at ``pose`` (3,) for z (s,); ``scratch.Jp`` (w, 3), ``Jz`` (w, s) <- Jacobians."""
+    mount, Jb, s = slam.sensor.mount, scratch.Jb, observed_width(slam.sensor)
     cx, cy, cz = locate(slam.sensor, z)
     body = observation.from_sensor(cx, cy, cz, mount)
     J = locate_jacobian(slam.sensor, z)
@@ -181,35 +189,35 @@ def place_observed(slam: Slam, pose: Array, z: Array, values: Array, work: Work[
         Jb[0, j] = mount.xx * J[j] + mount.xy * J[s + j] + mount.xz * J[2 * s + j]
         Jb[1, j] = mount.yx * J[j] + mount.yy * J[s + j] + mount.yz * J[2 * s + j]
         Jb[2, j] = mount.zx * J[j] + mount.zy * J[s + j] + mount.zz * J[2 * s + j]
-    insert(slam.landmark, robot_frame(pose), body, Jb, mount, values, work.Jp, work.Jz)
+    insert(slam.landmark, robot_frame(pose), body, Jb, mount, values, scratch.Jp, scratch.Jz)
 
 
 @inner
-def gather(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """``work.rows`` (3 + w m, n + base) <- rows of P and of Phi of the robot and of the ``m`` seen landmarks."""
-    gather_all_rows(state, local.Phi, landmark_width(slam.landmark), work.at, m, work.rows)
+def gather(slam: Slam, state: State, m: int, factors: Factors, scratch: Scratch[NamedTuple]) -> None:
+    """``scratch.rows`` (3 + w m, n + base) <- rows of P and of Phi of the robot and of the ``m`` seen landmarks."""
+    gather_all_rows(state, factors.Phi, landmark_width(slam.landmark), scratch.at, m, scratch.rows)
 
 
 @inner
-def linearise_seen(slam: Slam, state: State, k: int, m: int, work: Work[NamedTuple]) -> None:
-    """``work``: zhat (s m,), Hp (m, s, 3), Hl (m, s, w) <- h of the seen landmarks; Jacobians by the filter's error."""
+def linearise_seen(slam: Slam, state: State, k: int, m: int, scratch: Scratch[NamedTuple]) -> None:
+    """``scratch``: zhat (s m,), Hp (m, s, 3), Hl (m, s, w) <- h of the seen landmarks, and Jacobians by the error."""
     pose, w, s = state.x[:3], landmark_width(slam.landmark), observed_width(slam.sensor)
     for i in range(m):
-        o, expected = work.at[i], work.zhat[s * i : s * i + s]
+        o, expected = scratch.at[i], scratch.zhat[s * i : s * i + s]
         values = state.x[o : o + w]
-        linearise(slam, pose, values, k, work.label[i], expected, work.Hp[i], work.Hl[i], work)
-        to_error(slam.error, pose, values, work.Hp[i], work.Hl[i])
+        linearise(slam, pose, values, k, scratch.label[i], expected, scratch.Hp[i], scratch.Hl[i], scratch)
+        to_error(slam.error, pose, values, scratch.Hp[i], scratch.Hl[i])
 
 
 @inner
-def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> None:
-    """``work.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``work.S`` (s m, s m) <- H P H'."""
+def combine_seen(slam: Slam, state: State, m: int, scratch: Scratch[NamedTuple]) -> None:
+    """``scratch.A`` (s m, n + base) <- H P from the gathered rows; upper half of ``scratch.S`` (s m, s m) <- H P H'."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
-    A, S, Hp, Hl, width = work.A, work.S, work.Hp, work.Hl, state.n + state.base
+    A, S, Hp, Hl, width = scratch.A, scratch.S, scratch.Hp, scratch.Hl, state.n + state.base
     for i in range(m):
-        combine(slam.landmark, Hp[i], Hl[i], work.rows[:, :width], i, A[s * i : s * i + s, :width])
+        combine(slam.landmark, Hp[i], Hl[i], scratch.rows[:, :width], i, A[s * i : s * i + s, :width])
     for i in range(m):
-        o = work.at[i]
+        o = scratch.at[i]
         for row in range(s * i + s):
             for a in range(s):
                 total = 0.0
@@ -224,12 +232,12 @@ def combine_seen(slam: Slam, state: State, m: int, work: Work[NamedTuple]) -> No
 
 
 @inner
-def innovate(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> Array:
-    """Innovation (s m,) of the ``m`` landmarks, which is the last column of ``work.A``."""
+def innovate(slam: Slam, state: State, data: Data, m: int, scratch: Scratch[NamedTuple]) -> Array:
+    """Innovation (s m,) of the ``m`` landmarks, which is the last column of ``scratch.A``."""
     s = observed_width(slam.sensor)
-    y = work.A[: s * m, state.n + state.base]
+    y = scratch.A[: s * m, state.n + state.base]
     for i in range(m):
-        measured, expected = data.z[work.known[i]], work.zhat[s * i : s * i + s]
+        measured, expected = data.z[scratch.known[i]], scratch.zhat[s * i : s * i + s]
         wrap_residual(slam.sensor, expected, measured)
         for a in range(s):
             y[s * i + a] = measured[a] - expected[a]
@@ -245,18 +253,18 @@ def correct_at_once(
     k: int,
     m: int,
     has_innovation: bool,
-    local: Factors,
-    work: Work[NamedTuple],
+    factors: Factors,
+    scratch: Scratch[NamedTuple],
 ) -> tuple[int, float, float]:
-    """The update of a filter that does not iterate: it is led by what :func:`predict_innovation` leaves in ``work``."""
+    """The update of a filter that does not iterate: it uses what :func:`predict_innovation` leaves in ``scratch``."""
     code, total = 0, 0.0
     if not has_innovation:
-        code, total = predict_innovation(update, slam, state, data, k, m, local, work)
+        code, total = predict_innovation(update, slam, state, data, k, m, factors, scratch)
     if code > 0:
         return code, np.nan, np.nan
-    code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+    code, nis, log_det = divide_by_root(state, observed_width(slam.sensor) * m, scratch, total)
     if code == 0:
-        apply(slam, state, m, local, work)
+        apply(slam, state, m, factors, scratch)
     return code, nis, log_det
 
 
@@ -269,64 +277,64 @@ def correct_iterated(
     k: int,
     m: int,
     has_innovation: bool,
-    local: Factors,
-    work: Work[Any],
+    factors: Factors,
+    scratch: Scratch[Any],
 ) -> tuple[int, float, float]:
     """The update in ``update.passes``, each linearised where the one before led to, from the same prior."""
     w = landmark_width(slam.landmark)
     involved, first_nis, first_log_det = 3 + w * m, np.nan, np.nan
-    gather(slam, state, m, local, work)
+    gather(slam, state, m, factors, scratch)
     for a in range(involved):
-        work.prior[a] = state.x[state_index(w, a, work.at)]
+        scratch.prior[a] = state.x[state_index(w, a, scratch.at)]
     for i in range(update.passes):
-        if not innovate_again(update, slam, state, data, k, m, work):
+        if not innovate_again(update, slam, state, data, k, m, scratch):
             return POSE, np.nan, np.nan
-        code, nis, log_det = whiten(slam, state, data, m, work)
+        code, nis, log_det = whiten(slam, state, data, m, scratch)
         if code > 0:
             return code, nis, log_det
         if i == 0:
             first_nis, first_log_det = nis, log_det
         is_last = i == update.passes - 1
         for a in range(involved):
-            j = state_index(w, a, work.at)
-            state.x[j] = work.prior[a] + (0.0 if is_last else shift(slam, state, m, j, work))
-    apply(slam, state, m, local, work)
+            j = state_index(w, a, scratch.at)
+            state.x[j] = scratch.prior[a] + (0.0 if is_last else shift(slam, state, m, j, scratch))
+    apply(slam, state, m, factors, scratch)
     return 0, first_nis, first_log_det
 
 
 @inner
-def whiten(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> tuple[int, float, float]:
+def whiten(slam: Slam, state: State, data: Data, m: int, scratch: Scratch[NamedTuple]) -> tuple[int, float, float]:
     """S (s m, s m) <- root of S + R; A and the innovation <- divided by it. As :func:`divide_by_root`."""
-    total = add_noise(slam, state, data, m, work)
-    return divide_by_root(state, observed_width(slam.sensor) * m, work, total)
+    total = add_noise(slam, state, data, m, scratch)
+    return divide_by_root(state, observed_width(slam.sensor) * m, scratch, total)
 
 
 @inner
-def add_noise(slam: Slam, state: State, data: Data, m: int, work: Work[NamedTuple]) -> float:
+def add_noise(slam: Slam, state: State, data: Data, m: int, scratch: Scratch[NamedTuple]) -> float:
     """S (s m, s m) <- S + R; returns a sum that is finite if innovation and S are."""
     s = observed_width(slam.sensor)
     rows, width = s * m, state.n + state.base
-    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    S, joined = scratch.S[:rows, :rows], scratch.A[:rows, : width + 1]
     y, total = joined[:, width], 0.0
     for i in range(m):
         for a in range(s):
             row = s * i + a
             for c in range(s):
-                S[row, s * i + c] += data.R[work.known[i], a, c]
+                S[row, s * i + c] += data.R[scratch.known[i], a, c]
             total += y[row] + sum_of(S[row, row:])
     return total
 
 
 @inner
-def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float) -> tuple[int, float, float]:
+def divide_by_root(state: State, rows: int, scratch: Scratch[NamedTuple], total: float) -> tuple[int, float, float]:
     """S <- its root, and A and the innovation <- divided by it; ``total`` is finite if all that is given is.
 
     Returns a code of REASONS, 0 where all is well, the NIS, and log det S.
     """
     width = state.n + state.base
-    S, joined = work.S[:rows, :rows], work.A[:rows, : width + 1]
+    S, joined = scratch.S[:rows, :rows], scratch.A[:rows, : width + 1]
     y = joined[:, width]
-    if not definite_root(S, work.scale):
+    if not definite_root(S, scratch.scale):
         return INNOVATION if np.isfinite(total) else NOT_FINITE, np.nan, np.nan
     solve_transposed(S, joined)
     nis, log_det = 0.0, 0.0
@@ -339,34 +347,34 @@ def divide_by_root(state: State, rows: int, work: Work[NamedTuple], total: float
 
 
 @inner
-def shift(slam: Slam, state: State, m: int, j: int, work: Work[NamedTuple]) -> float:
+def shift(slam: Slam, state: State, m: int, j: int, scratch: Scratch[NamedTuple]) -> float:
     """By how much the whitened gain moves variable j of an additive error."""
     total, y = 0.0, state.n + state.base
     for row in range(observed_width(slam.sensor) * m):
-        total += work.A[row, j] * work.A[row, y]
+        total += scratch.A[row, j] * scratch.A[row, y]
     return total
 
 
 @inner
-def apply(slam: Slam, state: State, m: int, local: Factors, work: Work[NamedTuple]) -> None:
-    """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; with the columns of Phi as ``local`` says."""
+def apply(slam: Slam, state: State, m: int, factors: Factors, scratch: Scratch[NamedTuple]) -> None:
+    """x (n,) <- moved by W' S^-1/2 innovation, P (n, n) <- P - W' W; the columns of Phi as ``factors`` says."""
     rows, n = observed_width(slam.sensor) * m, state.n
-    A, y = work.A[:rows, :n], work.A[:rows, n + state.base]
-    retract(slam.error, slam, state, A, y, work)
+    A, y = scratch.A[:rows, :n], scratch.A[:rows, n + state.base]
+    retract(slam.error, slam, state, A, y, scratch)
     add_gram_to_state(-1.0, A, state.P, n)
-    apply_beyond(state, rows, local, work)
+    apply_beyond(state, rows, factors, scratch)
 
 
 @inner
-def apply_beyond(state: State, rows: int, local: Factors, work: Work[NamedTuple]) -> None:
+def apply_beyond(state: State, rows: int, factors: Factors, scratch: Scratch[NamedTuple]) -> None:
     """Phi, Psi and theta <- what a correction of the active part says of the rest."""
     n, base = state.n, state.base
-    A, y = work.A[:rows, :n], work.A[:rows, n + base]
+    A, y = scratch.A[:rows, :n], scratch.A[:rows, n + base]
     if base > 0:
-        beyond = work.A[:rows, n : n + base]
-        add_product_of_transposed(-1.0, A, beyond, local.Phi[:n, :base])
-        add_gram(1.0, beyond, local.Psi[:base, :base])
-        add_transposed_times(beyond, y, local.theta[:base])
+        beyond = scratch.A[:rows, n : n + base]
+        add_product_of_transposed(-1.0, A, beyond, factors.Phi[:n, :base])
+        add_gram(1.0, beyond, factors.Psi[:base, :base])
+        add_transposed_times(beyond, y, factors.theta[:base])
 
 
 @inner

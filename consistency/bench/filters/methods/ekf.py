@@ -22,7 +22,7 @@ from consistency.bench.filters.kernel.part_functions import (
     stands_apart,
 )
 from consistency.bench.filters.kernel.update_steps import (
-    Work,
+    Scratch,
     add_noise,
     combine_seen,
     correct_at_once,
@@ -61,9 +61,9 @@ def estimate_stands_apart(point: AtEstimate) -> bool:
 
 @implement(place, AtEstimate)
 def place_at_estimate(
-    point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+    point: AtEstimate, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Scratch[NamedTuple]
 ) -> None:
-    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], work)
+    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], scratch)
 
 
 @part()
@@ -76,14 +76,21 @@ implement(correct, Joint)(correct_at_once)
 
 @implement(predict_innovation, Joint)
 def predict_innovation_linearised(
-    update: NamedTuple, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[NamedTuple]
+    update: NamedTuple,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    factors: Factors,
+    scratch: Scratch[NamedTuple],
 ) -> tuple[int, float]:
     """Innovation and S with Jacobians at the prediction, eq. 11; an iterated update begins there, too."""
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    innovate(slam, state, data, m, work)
-    return 0, add_noise(slam, state, data, m, work)
+    gather(slam, state, m, factors, scratch)
+    linearise_seen(slam, state, k, m, scratch)
+    combine_seen(slam, state, m, scratch)
+    innovate(slam, state, data, m, scratch)
+    return 0, add_noise(slam, state, data, m, scratch)
 
 
 def sensor_of(belief: Belief, uvd: bool) -> Any:

@@ -42,7 +42,7 @@ from consistency.bench.filters.kernel.part_functions import (
     world_point,
 )
 from consistency.bench.filters.kernel.update_steps import (
-    Work,
+    Scratch,
     add_gram_to_state,
     add_noise,
     combine_seen,
@@ -138,22 +138,22 @@ class Polar(NamedTuple):
 
 @implement(propagate, Polar)
 def propagate_polar(
-    error: Polar, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    error: Polar, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """Pose and landmarks move; P <- F P F' + G Q G', F the identity but for a block for each landmark."""
-    x, P, n, G = state.x, state.P, state.n, work.small
+    x, P, n, G = state.x, state.P, state.n, scratch.small
     noise_columns(slam.motion, x[:3], u, G)
     before = robot_frame(x[:3])
     move(x[:3], u, x[:3])
-    after, noise = robot_frame(x[:3]), work.rows[:2, :n]
+    after, noise = robot_frame(x[:3]), scratch.rows[:2, :n]
     for o in range(3, n, 3):
-        body = _move_landmark(slam.landmark.mount, before, after, x[o : o + 3], work.Jz, work.Jb)
-        move_block(P, n, o, work.Jz)
+        body = _move_landmark(slam.landmark.mount, before, after, x[o : o + 3], scratch.Jz, scratch.Jb)
+        move_block(P, n, o, scratch.Jz)
         for i in range(2):
             dx = -after.c * G[0, i] - after.s * G[1, i] + G[2, i] * body[1]
             dy = after.s * G[0, i] - after.c * G[1, i] - G[2, i] * body[0]
             for a in range(3):
-                noise[i, o + a] = work.Jb[a, 0] * dx + work.Jb[a, 1] * dy
+                noise[i, o + a] = scratch.Jb[a, 0] * dx + scratch.Jb[a, 1] * dy
     for i in range(2):
         turn = G[2, i]
         noise[i, 0], noise[i, 1], noise[i, 2] = G[0, i] + x[1] * turn, G[1, i] - x[0] * turn, turn
@@ -193,9 +193,9 @@ def to_polar(error: Polar, pose: Array, values: Array, Hp: Array, Hl: Array) -> 
 
 
 @implement(retract, Polar)
-def retract_polar(error: Polar, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+def retract_polar(error: Polar, slam: Slam, state: State, A: Array, y: Array, scratch: Scratch[NamedTuple]) -> None:
     """Pose (3,) <- Exp(xi) T, each landmark (3,) <- e^s exp(Omega) q, with the error A' y."""
-    x, delta = state.x, work.delta[: state.n]
+    x, delta = state.x, scratch.delta[: state.n]
     fill(delta, 0.0)
     add_transposed_times(A, y, delta)
     move_pose(x[:3], delta[:3], x[:3])
@@ -230,16 +230,16 @@ def predict_innovation_equivariant(
     data: Data,
     k: int,
     m: int,
-    local: Factors,
-    work: Work[NamedTuple],
+    factors: Factors,
+    scratch: Scratch[NamedTuple],
 ) -> tuple[int, float]:
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
+    gather(slam, state, m, factors, scratch)
+    linearise_seen(slam, state, k, m, scratch)
     for i in range(m):
-        _average(slam.sensor, data.z[work.known[i]], state.x[work.at[i] : work.at[i] + 3], work.Hl[i])
-    combine_seen(slam, state, m, work)
-    innovate(slam, state, data, m, work)
-    return 0, add_noise(slam, state, data, m, work)
+        _average(slam.sensor, data.z[scratch.known[i]], state.x[scratch.at[i] : scratch.at[i] + 3], scratch.Hl[i])
+    combine_seen(slam, state, m, scratch)
+    innovate(slam, state, data, m, scratch)
+    return 0, add_noise(slam, state, data, m, scratch)
 
 
 @inner

@@ -23,13 +23,13 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     landmark_point,
     landmark_width,
-    make_notes,
+    make_point_arrays,
     move,
     place,
     propagate_covariance_at,
     propagate_covariance_by,
 )
-from consistency.bench.filters.kernel.update_steps import Work, place_observed
+from consistency.bench.filters.kernel.update_steps import Scratch, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.fej import FirstEstimateKalman
 from consistency.referee.types import Array
@@ -47,17 +47,17 @@ class FirstEstimates(NamedTuple):
     landmarks: Array  # (labels, w)
 
 
-@implement(make_notes, FirstEstimate)
+@implement(make_point_arrays, FirstEstimate)
 def note_first_estimates(point: FirstEstimate, w: int, steps: int, labels: int) -> FirstEstimates:
     return FirstEstimates(matrix(steps + 1, 3), matrix(labels, w))
 
 
 @implement(propagate_covariance_at, FirstEstimate)
 def propagate_covariance_between_first_estimates(
-    point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    point: FirstEstimate, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """F by the displacement p_k+1|k - p_k|k-1 between first estimates; notes the prediction."""
-    before, after = work.notes.path[k], work.notes.path[k + 1]
+    before, after = scratch.of_point.path[k], scratch.of_point.path[k + 1]
     if k == 0:
         copy(state.x[:3], before)
     move(state.x[:3], u, after)
@@ -65,22 +65,22 @@ def propagate_covariance_between_first_estimates(
 
 
 @implement(landmark_point, FirstEstimate)
-def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, work: Work[NamedTuple]) -> Array:
-    first: Array = work.notes.landmarks[label]
+def landmark_at_first_estimate(point: FirstEstimate, values: Array, label: int, scratch: Scratch[NamedTuple]) -> Array:
+    first: Array = scratch.of_point.landmarks[label]
     return first
 
 
 @implement(place, FirstEstimate)
 def place_first_estimate(
-    point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+    point: FirstEstimate, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """x[n:n + w] <- the inverse of h at the estimated pose, noted; its Jacobian by the heading at the prediction."""
     w = landmark_width(slam.landmark)
-    pose, values, predicted = state.x[:3], state.x[state.n : state.n + w], work.notes.path[k + 1]
-    place_observed(slam, pose, z, values, work)
-    copy(values, work.notes.landmarks[label])
-    work.Jp[0, 2] -= pose[1] - predicted[1]
-    work.Jp[1, 2] += pose[0] - predicted[0]
+    pose, values, predicted = state.x[:3], state.x[state.n : state.n + w], scratch.of_point.path[k + 1]
+    place_observed(slam, pose, z, values, scratch)
+    copy(values, scratch.of_point.landmarks[label])
+    scratch.Jp[0, 2] -= pose[1] - predicted[1]
+    scratch.Jp[1, 2] += pose[0] - predicted[0]
 
 
 FILTERS = variants(FirstEstimateKalman, "fej-ekf", ekf.parts, point=FirstEstimate())

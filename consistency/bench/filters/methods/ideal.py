@@ -19,7 +19,7 @@ from consistency.bench.filters.kernel.part_functions import (
     propagate_covariance_at,
     propagate_covariance_by,
 )
-from consistency.bench.filters.kernel.update_steps import Work, place_observed
+from consistency.bench.filters.kernel.update_steps import Scratch, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import invert_at, landmark_at_known, motion_at_known, observation_at_known
 from consistency.bench.filters.textbook.ideal import IdealKalman, truth_of
@@ -46,7 +46,7 @@ implement(landmark_point, AtTruth)(landmark_at_known)
 
 @implement(propagate_covariance_at, AtTruth)
 def propagate_covariance_at_truth(
-    point: AtTruth, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    point: AtTruth, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """F by the true displacement of the robot."""
     before, after = point.path[k], point.path[k + 1]
@@ -55,10 +55,10 @@ def propagate_covariance_at_truth(
 
 @implement(place, AtTruth)
 def place_at_truth(
-    point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+    point: AtTruth, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Scratch[NamedTuple]
 ) -> None:
-    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], work)
-    invert_at(point, slam, k, label, work)
+    place_observed(slam, state.x[:3], z, state.x[state.n : state.n + landmark_width(slam.landmark)], scratch)
+    invert_at(point, slam, k, label, scratch)
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:

@@ -16,7 +16,13 @@ from consistency.bench.filters.kernel.part_functions import (
     observed_width,
     predict_innovation,
 )
-from consistency.bench.filters.kernel.update_steps import Work, combine_seen, correct_iterated, innovate, linearise_seen
+from consistency.bench.filters.kernel.update_steps import (
+    Scratch,
+    combine_seen,
+    correct_iterated,
+    innovate,
+    linearise_seen,
+)
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.ekf import predict_innovation_linearised
 from consistency.bench.filters.textbook.iekf import PASSES, IteratedKalman
@@ -35,20 +41,20 @@ implement(correct, Iterated)(correct_iterated)
 
 @implement(innovate_again, Iterated)
 def innovate_about_estimate(
-    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, work: Work[NamedTuple]
+    update: Iterated, slam: Slam, state: State, data: Data, k: int, m: int, scratch: Scratch[NamedTuple]
 ) -> bool:
     """The innovation is z - h(x) - H (prior - x)."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    x, prior, y = state.x, work.prior, innovate(slam, state, data, m, work)
+    linearise_seen(slam, state, k, m, scratch)
+    combine_seen(slam, state, m, scratch)
+    x, prior, y = state.x, scratch.prior, innovate(slam, state, data, m, scratch)
     for i in range(m):
-        o = work.at[i]
+        o = scratch.at[i]
         for a in range(s):
             for c in range(3):
-                y[s * i + a] -= work.Hp[i, a, c] * (prior[c] - x[c])
+                y[s * i + a] -= scratch.Hp[i, a, c] * (prior[c] - x[c])
             for c in range(w):
-                y[s * i + a] -= work.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
+                y[s * i + a] -= scratch.Hl[i, a, c] * (prior[3 + w * i + c] - x[o + c])
     return True
 
 

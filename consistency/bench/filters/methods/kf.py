@@ -27,7 +27,7 @@ from consistency.bench.filters.kernel.part_functions import (
     propagate_covariance_at,
     robot_frame,
 )
-from consistency.bench.filters.kernel.update_steps import Work, linearise_at
+from consistency.bench.filters.kernel.update_steps import Scratch, linearise_at
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.kf import LinearKalman
@@ -60,39 +60,39 @@ def observation_at_known(point: Any, pose: Array, k: int) -> Array:
 
 
 @implement(landmark_point, Reference)
-def landmark_at_known(point: Any, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+def landmark_at_known(point: Any, values: Array, label: int, scratch: Scratch[NamedTuple]) -> Array:
     return point.landmarks[label]
 
 
 @implement(propagate_covariance_at, Reference)
 def propagate_covariance_at_reference(
-    point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    point: Reference, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     propagate_covariance(point.path[k], u, state.P, state.n, Phi, state.base)
 
 
 @inner
-def invert_at(point: Any, slam: Slam, k: int, label: int, work: Work[NamedTuple]) -> Array:
-    """``work.Jz`` <- Hl^-1 and ``work.Jp`` <- -Hl^-1 Hp at the point; returns h (s,) there."""
+def invert_at(point: Any, slam: Slam, k: int, label: int, scratch: Scratch[NamedTuple]) -> Array:
+    """``scratch.Jz`` <- Hl^-1 and ``scratch.Jp`` <- -Hl^-1 Hp at the point; returns h (s,) there."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     expected, Hp, Hl = vector(s), matrix(s, 3), matrix(s, w)
     linearise_at(slam, robot_frame(point.path[k + 1]), point.landmarks[label], expected, Hp, Hl)
-    copy_matrix(np.linalg.inv(Hl), work.Jz)
-    copy_matrix(-np.dot(work.Jz, Hp), work.Jp)
+    copy_matrix(np.linalg.inv(Hl), scratch.Jz)
+    copy_matrix(-np.dot(scratch.Jz, Hp), scratch.Jp)
     return expected
 
 
 @implement(place, Reference)
 def place_about_reference(
-    point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+    point: Reference, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """By the landmark that solves the expanded h for z (3,), where w = 3."""
     pose, landmark, n = point.path[k + 1], point.landmarks[label], state.n
-    expected = invert_at(point, slam, k, label, work)
+    expected = invert_at(point, slam, k, label, scratch)
     for i in range(len(landmark)):
         state.x[n + i] = landmark[i]
         for j in range(3):
-            state.x[n + i] += work.Jz[i, j] * (z[j] - expected[j]) + work.Jp[i, j] * (state.x[j] - pose[j])
+            state.x[n + i] += scratch.Jz[i, j] * (z[j] - expected[j]) + scratch.Jp[i, j] * (state.x[j] - pose[j])
 
 
 def parts(problem: Problem, controls: Array, uvd: bool) -> Slam:

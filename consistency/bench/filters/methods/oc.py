@@ -40,13 +40,13 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     landmark_point,
     landmark_width,
-    make_notes,
+    make_point_arrays,
     move,
     place,
     propagate_covariance_at,
     propagate_covariance_by,
 )
-from consistency.bench.filters.kernel.update_steps import Work, place_observed
+from consistency.bench.filters.kernel.update_steps import Scratch, place_observed
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.oc import ConstrainedKalman
 from consistency.referee.types import Array, Indices
@@ -67,7 +67,7 @@ class UnobservedTurn(NamedTuple):
     at: Array  # (w,), the point of the landmark asked for last
 
 
-@implement(make_notes, ObservabilityConstrained)
+@implement(make_point_arrays, ObservabilityConstrained)
 def note_unobserved_turn(point: ObservabilityConstrained, w: int, steps: int, labels: int) -> UnobservedTurn:
     path, landmarks = matrix(steps + 1, 2), matrix(labels, 2)
     return UnobservedTurn(path, landmarks, integers(labels, 0), filled(2, 0.0), vector(w))
@@ -75,11 +75,17 @@ def note_unobserved_turn(point: ObservabilityConstrained, w: int, steps: int, la
 
 @implement(propagate_covariance_at, ObservabilityConstrained)
 def propagate_covariance_constrained(
-    point: ObservabilityConstrained, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    point: ObservabilityConstrained,
+    slam: Slam,
+    state: State,
+    k: int,
+    u: Array,
+    Phi: Array,
+    scratch: Scratch[NamedTuple],
 ) -> None:
     """F by the displacement p_k+1|k - p*_k|k; notes a_k+1 and e."""
-    x, notes, predicted, w = state.x, work.notes, work.pose, landmark_width(slam.landmark)
-    before, after, shift = notes.path[k], notes.path[k + 1], notes.shift
+    x, of_point, predicted, w = state.x, scratch.of_point, scratch.pose, landmark_width(slam.landmark)
+    before, after, shift = of_point.path[k], of_point.path[k + 1], of_point.shift
     move(x[:3], u, predicted)
     count = (state.n - 3) // w
     for a in range(2):
@@ -87,19 +93,21 @@ def propagate_covariance_constrained(
             before[a] = x[a]
         total = x[a] - before[a]
         for i in range(count):
-            total += x[3 + w * i + a] - notes.landmarks[notes.order[i], a]
+            total += x[3 + w * i + a] - of_point.landmarks[of_point.order[i], a]
         shift[a] = total / (1 + count)
         after[a] = predicted[a] - shift[a]
     propagate_covariance_by(after[0] - before[0], after[1] - before[1], state.P, state.n, Phi, state.base)
 
 
 @implement(landmark_point, ObservabilityConstrained)
-def landmark_constrained(point: ObservabilityConstrained, values: Array, label: int, work: Work[NamedTuple]) -> Array:
+def landmark_constrained(
+    point: ObservabilityConstrained, values: Array, label: int, scratch: Scratch[NamedTuple]
+) -> Array:
     """l*_i = l_i + e (w,) of landmark ``label``, at the height of the estimate."""
-    notes = work.notes
-    at: Array = notes.at
+    of_point = scratch.of_point
+    at: Array = of_point.at
     for a in range(2):
-        at[a] = notes.landmarks[label, a] + notes.shift[a]
+        at[a] = of_point.landmarks[label, a] + of_point.shift[a]
     for a in range(2, len(values)):
         at[a] = values[a]
     return at
@@ -107,14 +115,20 @@ def landmark_constrained(point: ObservabilityConstrained, values: Array, label: 
 
 @implement(place, ObservabilityConstrained)
 def place_constrained(
-    point: ObservabilityConstrained, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[NamedTuple]
+    point: ObservabilityConstrained,
+    slam: Slam,
+    state: State,
+    k: int,
+    label: int,
+    z: Array,
+    scratch: Scratch[NamedTuple],
 ) -> None:
     """x[n:n + w] <- the inverse of h at the estimated pose, with its Jacobians; notes l_i."""
-    x, n, notes, w = state.x, state.n, work.notes, landmark_width(slam.landmark)
-    place_observed(slam, x[:3], z, x[n : n + w], work)
-    notes.order[(n - 3) // w] = label
+    x, n, of_point, w = state.x, state.n, scratch.of_point, landmark_width(slam.landmark)
+    place_observed(slam, x[:3], z, x[n : n + w], scratch)
+    of_point.order[(n - 3) // w] = label
     for a in range(2):
-        notes.landmarks[label, a] = notes.path[k + 1, a] + x[n + a] - x[a]
+        of_point.landmarks[label, a] = of_point.path[k + 1, a] + x[n + a] - x[a]
 
 
 FILTERS = variants(ConstrainedKalman, "oc-ekf", ekf.parts, point=ObservabilityConstrained())

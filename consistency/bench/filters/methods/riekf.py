@@ -20,7 +20,7 @@ from consistency.bench.filters.kernel.part_functions import (
     retract,
     to_error,
 )
-from consistency.bench.filters.kernel.update_steps import Work, add_gram_to_state
+from consistency.bench.filters.kernel.update_steps import Scratch, add_gram_to_state
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.parts.invariant_pose import exponential, shifted_covariance
 from consistency.bench.filters.textbook.riekf import RightInvariantKalman
@@ -34,13 +34,13 @@ class RightInvariant(NamedTuple):
 
 @implement(propagate, RightInvariant)
 def propagate_right(
-    error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, work: Work[NamedTuple]
+    error: RightInvariant, slam: Slam, state: State, k: int, u: Array, Phi: Array, scratch: Scratch[NamedTuple]
 ) -> None:
     """x <- f(x) and P <- P + Ad G Q G' Ad': F is the identity, and the noise turns with the world, (n, q)."""
-    x, n, w, G = state.x, state.n, landmark_width(slam.landmark), work.small
+    x, n, w, G = state.x, state.n, landmark_width(slam.landmark), scratch.small
     noise_columns(slam.motion, x[:3], u, G)
     move(x[:3], u, x[:3])
-    noise = work.rows[:2, :n]
+    noise = scratch.rows[:2, :n]
     for c in range(2):
         turn = G[2, c]
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * turn, G[1, c] - x[0] * turn, turn
@@ -65,9 +65,11 @@ def insert_right(error: RightInvariant, pose: Array, values: Array, Jp: Array) -
 
 
 @implement(retract, RightInvariant)
-def retract_right(error: RightInvariant, slam: Slam, state: State, A: Array, y: Array, work: Work[NamedTuple]) -> None:
+def retract_right(
+    error: RightInvariant, slam: Slam, state: State, A: Array, y: Array, scratch: Scratch[NamedTuple]
+) -> None:
     """x (n,) <- exp(A' y) x, of the robot and of every landmark, with A (k, n) and y (k,)."""
-    x, delta = state.x, work.delta[: state.n]
+    x, delta = state.x, scratch.delta[: state.n]
     fill(delta, 0.0)
     add_transposed_times(A, y, delta)
     c, s, along, across = exponential(delta[2])

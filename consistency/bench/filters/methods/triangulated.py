@@ -27,7 +27,7 @@ from consistency.bench.filters.kernel.part_functions import (
     predict_innovation,
 )
 from consistency.bench.filters.kernel.update_steps import (
-    Work,
+    Scratch,
     combine_seen,
     correct_at_once,
     gather,
@@ -105,22 +105,22 @@ def predict_innovation_with_noise_at_prediction(
     data: Data,
     k: int,
     m: int,
-    local: Factors,
-    work: Work[NamedTuple],
+    factors: Factors,
+    scratch: Scratch[NamedTuple],
 ) -> tuple[int, float]:
-    gather(slam, state, m, local, work)
-    linearise_seen(slam, state, k, m, work)
-    combine_seen(slam, state, m, work)
-    return 0, _add_noise(update, data, m, innovate(slam, state, data, m, work), work)
+    gather(slam, state, m, factors, scratch)
+    linearise_seen(slam, state, k, m, scratch)
+    combine_seen(slam, state, m, scratch)
+    return 0, _add_noise(update, data, m, innovate(slam, state, data, m, scratch), scratch)
 
 
 @inner
-def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Work[NamedTuple]) -> float:
+def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, scratch: Scratch[NamedTuple]) -> float:
     """y (3 m,) <- y - bias, S (3 m, 3 m) <- S + R; returns a sum that is finite if all that is given is."""
     total, rows = 0.0, 3 * m
     for i in range(m):
         first = 3 * i
-        p = work.zhat[first : first + 3]
+        p = scratch.zhat[first : first + 3]
         if p[0] > 0.0:
             u, v, d = observation.project(p[0], p[1], p[2], noise.f, noise.B)
             J = observation.triangulate_jacobian(u, v, d, noise.f, noise.B)
@@ -131,13 +131,13 @@ def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, work: Wor
                 y[first + a] -= share * p[a]
                 for b in range(3):
                     for c in range(3):
-                        work.S[first + a, first + b] += J[3 * a + c] * variance[c] * J[3 * b + c]
+                        scratch.S[first + a, first + b] += J[3 * a + c] * variance[c] * J[3 * b + c]
         else:  # a point behind the camera has no pixel
             for a in range(3):
                 for b in range(3):
-                    work.S[first + a, first + b] += data.R[work.known[i], a, b]
+                    scratch.S[first + a, first + b] += data.R[scratch.known[i], a, b]
     for r in range(rows):
-        total += y[r] + sum_of(work.S[r, r:rows])
+        total += y[r] + sum_of(scratch.S[r, r:rows])
     return total
 
 

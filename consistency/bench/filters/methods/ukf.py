@@ -41,7 +41,7 @@ from consistency.bench.filters.kernel.part_functions import (
     add_motion_noise,
     correct,
     landmark_width,
-    make_room,
+    make_update_arrays,
     move,
     observed_width,
     predict,
@@ -52,7 +52,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.update_steps import (
     POSE,
-    Work,
+    Scratch,
     add_noise,
     correct_at_once,
     definite_root,
@@ -76,7 +76,7 @@ class Unscented(NamedTuple):
     kappa: float
 
 
-class SigmaRoom(NamedTuple):
+class SigmaArrays(NamedTuple):
     """Arrays of sigma points; L = 3 + w m."""
 
     F: Array  # (3, 3) Cov(f, C-coordinates)
@@ -89,10 +89,10 @@ class SigmaRoom(NamedTuple):
     landmark: Array  # (w,)
 
 
-@implement(make_room, Unscented)
-def sigma_room(update: Unscented, w: int, s: int, m: int, n: int) -> SigmaRoom:
+@implement(make_update_arrays, Unscented)
+def sigma_arrays(update: Unscented, w: int, s: int, m: int, n: int) -> SigmaArrays:
     L = 3 + w * m
-    return SigmaRoom(
+    return SigmaArrays(
         matrix(3, 3),
         matrix(7, 3),
         matrix(L, L),
@@ -115,17 +115,17 @@ def _weights(L: int, points: Unscented) -> tuple[float, float, float, float]:
 
 @implement(predict, Unscented)
 def predict_unscented(
-    update: Unscented, slam: Slam, state: State, k: int, u: Array, local: Factors, work: Work[SigmaRoom]
+    update: Unscented, slam: Slam, state: State, k: int, u: Array, factors: Factors, scratch: Scratch[SigmaArrays]
 ) -> None:
     """x, P <- mean and covariance (3, 3) of f over 7 sigma points of the robot; its rows of P <- F C^-1 P."""
     x, P = state.x, state.P
     spread, w0m, w0c, w = _weights(3, update)
-    C, F, Y = work.small, work.room.F, work.room.moved
+    C, F, Y = scratch.small, scratch.of_update.F, scratch.of_update.moved
     if not semidefinite_cholesky(P[:3, :3], C):
         P[0, 0] = np.nan  # an indefinite prior is reported by the loop
         return
-    copy(x[:3], work.pose)
-    move(work.pose, u, Y[6])
+    copy(x[:3], scratch.pose)
+    move(scratch.pose, u, Y[6])
     for j in range(3):
         for side in range(2):
             step = spread if side == 0 else -spread
@@ -140,13 +140,13 @@ def predict_unscented(
         for j in range(3):
             F[a, j] = w * spread * (Y[2 * j, a] - Y[2 * j + 1, a])
     propagate_covariance_root(P, 3, state.n, C, F)
-    propagate_covariance_root(local.Phi, 0, state.base, C, F)
+    propagate_covariance_root(factors.Phi, 0, state.base, C, F)
     for a in range(3):
         for b in range(3):
             P[a, b] = w0c * (Y[6, a] - x[a]) * (Y[6, b] - x[b])
             for i in range(6):
                 P[a, b] += w * (Y[i, a] - x[a]) * (Y[i, b] - x[b])
-    add_motion_noise(slam.motion, work.pose, u, P)
+    add_motion_noise(slam.motion, scratch.pose, u, P)
 
 
 implement(correct, Unscented)(correct_at_once)
@@ -154,29 +154,41 @@ implement(correct, Unscented)(correct_at_once)
 
 @implement(predict_innovation, Unscented)
 def predict_innovation_by_points(
-    update: Unscented, slam: Slam, state: State, data: Data, k: int, m: int, local: Factors, work: Work[SigmaRoom]
+    update: Unscented,
+    slam: Slam,
+    state: State,
+    data: Data,
+    k: int,
+    m: int,
+    factors: Factors,
+    scratch: Scratch[SigmaArrays],
 ) -> tuple[int, float]:
-    gather(slam, state, m, local, work)
-    if not innovate_by_points(update, slam, state, m, work):
+    gather(slam, state, m, factors, scratch)
+    if not innovate_by_points(update, slam, state, m, scratch):
         return POSE, np.nan
-    innovate(slam, state, data, m, work)
-    return 0, add_noise(slam, state, data, m, work)
+    innovate(slam, state, data, m, scratch)
+    return 0, add_noise(slam, state, data, m, scratch)
 
 
 @inner
-def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work: Work[SigmaRoom]) -> bool:
-    """zhat, S (without R) and A = P_zx from the rows of P in ``work``; False if P is indefinite.
+def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, scratch: Scratch[SigmaArrays]) -> bool:
+    """zhat, S (without R) and A = P_zx from the rows of P in ``scratch``; False if P is indefinite.
 
-    The points lie about ``state.x`` (n,), which need not be the mean of P; the linearisation is ``work.room.Mt``.
+    The points lie about ``state.x`` (n,), which need not be the mean of P; ``of_update.Mt`` is the linearisation.
     """
     w, width = landmark_width(slam.landmark), state.n + state.base
     L, rows = 3 + w * m, observed_width(slam.sensor) * m
     spread, w0m, w0c, weight = _weights(L, update)
-    if not _root(w, L, work):
+    if not _root(w, L, scratch):
         return False
-    _project(slam, state.x, m, spread, work)
-    Z, S, Mt, zhat = work.room.Z[: 2 * L + 1, :rows], work.S[:rows, :rows], work.room.Mt[:L, :rows], work.zhat
-    centre, U = Z[2 * L], work.room.U
+    _project(slam, state.x, m, spread, scratch)
+    Z, S, Mt, zhat = (
+        scratch.of_update.Z[: 2 * L + 1, :rows],
+        scratch.S[:rows, :rows],
+        scratch.of_update.Mt[:L, :rows],
+        scratch.zhat,
+    )
+    centre, U = Z[2 * L], scratch.of_update.U
     for c in range(rows):
         zhat[c] = w0m * centre[c]
     for i in range(2 * L):
@@ -195,25 +207,25 @@ def innovate_by_points(update: Unscented, slam: Slam, state: State, m: int, work
         if U[j, j] == 0.0:  # row j of Mt and the rest of row j of U are zero, and stay so
             U[j, j] = 1.0
     solve_upper(U[:L, :L], Mt)
-    product_of_transposed(Mt, work.rows[:L, :width], work.A[:rows, :width])
+    product_of_transposed(Mt, scratch.rows[:L, :width], scratch.A[:rows, :width])
     return True
 
 
 @inner
-def _root(w: int, L: int, work: Work[SigmaRoom]) -> bool:
+def _root(w: int, L: int, scratch: Scratch[SigmaArrays]) -> bool:
     """Upper root U = C' of the prior over the variables involved; False if it is indefinite."""
-    rows, at, U = work.rows, work.at, work.room.U[:L, :L]
+    rows, at, U = scratch.rows, scratch.at, scratch.of_update.U[:L, :L]
     for b in range(L):
         j = state_index(w, b, at)
         for a in range(b + 1):
             U[a, b] = rows[a, j]
-    return definite_root(U, work.scale) or _singular_root(w, L, work)
+    return definite_root(U, scratch.scale) or _singular_root(w, L, scratch)
 
 
 @inner
-def _singular_root(w: int, L: int, work: Work[SigmaRoom]) -> bool:
+def _singular_root(w: int, L: int, scratch: Scratch[SigmaArrays]) -> bool:
     """The root of a semidefinite prior: a zero pivot has a zero row."""
-    rows, at, U, block = work.rows, work.at, work.room.U[:L, :L], work.room.block[:L, :L]
+    rows, at, U, block = scratch.rows, scratch.at, scratch.of_update.U[:L, :L], scratch.of_update.block[:L, :L]
     for b in range(L):
         j = state_index(w, b, at)
         for a in range(L):
@@ -227,11 +239,17 @@ def _singular_root(w: int, L: int, work: Work[SigmaRoom]) -> bool:
 
 
 @inner
-def _project(slam: Slam, x: Array, m: int, spread: float, work: Work[SigmaRoom]) -> None:
+def _project(slam: Slam, x: Array, m: int, spread: float, scratch: Scratch[SigmaArrays]) -> None:
     """Z <- h of the sigma points, in pairs along the rows of U; the last row is h of the mean."""
     w, s = landmark_width(slam.landmark), observed_width(slam.sensor)
     L = 3 + w * m
-    at, U, Z, pose, landmark = work.at, work.room.U, work.room.Z, work.room.pose, work.room.landmark
+    at, U, Z, pose, landmark = (
+        scratch.at,
+        scratch.of_update.U,
+        scratch.of_update.Z,
+        scratch.of_update.pose,
+        scratch.of_update.landmark,
+    )
     for j in range(L):
         first = 0 if j < 3 else 3 + w * ((j - 3) // w)
         fill(U[j, first:j], 0.0)  # the lower half holds anything, and the variables of a part are moved together

@@ -1,11 +1,11 @@
-"""A robot-centred map whose observations are converted to its variables: parts, work arrays, motion, new landmarks.
+"""A robot-centred map whose observations are converted to its variables: parts, scratch arrays, motion, new landmarks.
 
 Where an update moves the robot and its clones, and the errors about those poses: charts of a robot-centred state.
 
 Apart, each pose is Exp(xi) T. Chained, in the order of time, pose j is E_j T_j with E_j = E_j-1 Exp(xi_j - xi_j-1), so
 that the motion between two poses depends on its own error alone. Errors about the poses moved so are C (xi - what moved
 them): row j of C is row j - 1 plus B_j = Ad(E_j-1) J_l(xi_j - xi_j-1) times the difference of the rows. The robot is
-the last; in place of the clone before it, it hangs on clone ``room.on``.
+the last; in place of the clone before it, it hangs on clone ``of_update.on``.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from consistency.bench.filters.kernel.part_functions import (
     Slam,
     State,
     Triple,
-    make_room,
+    make_update_arrays,
     move,
     noise_columns,
     place,
     predict,
 )
 from consistency.bench.filters.kernel.update_steps import (
-    Work,
+    Scratch,
     add_gram_to_state,
     multiply_columns,
     multiply_rows,
@@ -98,7 +98,7 @@ class Converted(NamedTuple):
     """No parameters. Observations are linear in the map, so there is no point at which they are linearised."""
 
 
-class ConvertingRoom(NamedTuple):
+class ConvertingArrays(NamedTuple):
     """For up to m landmarks and c clones in a step, and a state of up to n variables."""
 
     at: Indices  # (m + c,) offsets of the seen landmarks, then of clones: of those that are parked, or all
@@ -139,11 +139,11 @@ def _every_third(n: int) -> Indices:
     return places
 
 
-@implement(make_room, Converting)
-def converting_room(update: Converting, w: int, s: int, m: int, n: int) -> ConvertingRoom:
+@implement(make_update_arrays, Converting)
+def converting_arrays(update: Converting, w: int, s: int, m: int, n: int) -> ConvertingArrays:
     c = max(m, min(update.clones, (n - 3) // 6))
     most = 3 + 3 * (m + c)
-    return ConvertingRoom(
+    return ConvertingArrays(
         integers(m + c, 0), integers(c, 0), integers(m, 0), matrix(most, n),
         matrix(most, most), matrix(most, most), _every_third(m + c), integers(1, 0),
         matrix(c + 1, 3), blocks(c + 1, 3, 3), blocks(c + 1, 3, 3),
@@ -161,13 +161,13 @@ def predict_centred(
     state: State,
     k: int,
     u: Array,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> None:
-    x, P, n, room, G = state.x, state.P, state.n, work.room, work.small
+    x, P, n, of_update, G = state.x, state.P, state.n, scratch.of_update, scratch.small
     noise_columns(slam.motion, x[:3], u, G)
     move(x[:3], u, x[:3])
-    noise = room.noise[: 4 if update.spread else 2, :n]
+    noise = of_update.noise[: 4 if update.spread else 2, :n]
     fill_matrix(noise, 0.0)
     for c in range(2):
         noise[c, 0], noise[c, 1], noise[c, 2] = G[0, c] + x[1] * G[2, c], G[1, c] - x[0] * G[2, c], G[2, c]
@@ -176,9 +176,9 @@ def predict_centred(
     moving = 0
     for label in range(len(state.offset)):
         o = state.offset[label]
-        if o >= 0 and local.of[label] < 0:
-            J, own, there, rho = room.J[moving], room.own_spread[moving], room.poses[0], x[o + 2]
-            D, B, L, means = room.three[0], room.three[1], room.three[2], room.three[3]
+        if o >= 0 and parked.of[label] < 0:
+            J, own, there, rho = of_update.J[moving], of_update.own_spread[moving], of_update.poses[0], x[o + 2]
+            D, B, L, means = of_update.three[0], of_update.three[1], of_update.three[2], of_update.three[3]
             point = carried(x[o : o + 3], turn, slam.landmark.mount, there, J, D, B)
             along, about = u[0] * slam.motion.sigma_v, u[0] * slam.motion.sigma_omega
             for a in range(3):
@@ -188,7 +188,7 @@ def predict_centred(
                 take_root(P, o, L)
                 second_order(
                     x[o : o + 3], L, point, D, B, turn, slam.landmark.mount, along, about,
-                    0 if update.own_spread else 3, room.ways, means, own,
+                    0 if update.own_spread else 3, of_update.ways, means, own,
                 )  # fmt: skip
                 if not update.own_spread:
                     d0, d1, d2 = row_times(D, 0, c, s, 0.0), row_times(D, 1, c, s, 0.0), row_times(D, 2, c, s, 0.0)
@@ -200,22 +200,22 @@ def predict_centred(
                     if update.spread:  # the square of a normal of variance s^2 has variance 2 s^4
                         noise[2, o + a], noise[3, o + a] = np.sqrt(2.0) * means[0, a], np.sqrt(2.0) * means[1, a]
             copy(there, x[o : o + 3])
-            room.moving[moving] = o
+            of_update.moving[moving] = o
             moving += 1
-    _move_rows(P, n, room.moving, room.J, moving)
+    _move_rows(P, n, of_update.moving, of_update.J, moving)
     for i in range(moving if state.base > 0 else 0):
-        multiply_rows(local.factors.Phi[room.moving[i] : room.moving[i] + 3], room.J[i], 0, state.base)
+        multiply_rows(parked.factors.Phi[of_update.moving[i] : of_update.moving[i] + 3], of_update.J[i], 0, state.base)
     add_gram_to_state(1.0, noise, P, n)
     for i in range(moving if update.spread else 0):
-        o = room.moving[i]
+        o = of_update.moving[i]
         for a in range(3):
             for b in range(a, 3):
-                P[o + a, o + b] += room.own_spread[i, a, b]
+                P[o + a, o + b] += of_update.own_spread[i, a, b]
     if update.blurred > 0.0:
         for label in range(len(state.offset)):
             o = state.offset[label]
-            if o >= 0 and is_out_of_sight(label, local) and _is_driven_through(update, x, P, o, noise[1, o]):
-                forget(label, state, local)
+            if o >= 0 and is_out_of_sight(label, parked) and _is_driven_through(update, x, P, o, noise[1, o]):
+                forget(label, state, parked)
 
 
 @inner
@@ -261,74 +261,80 @@ def _move_rows(P: Array, n: int, at: Indices, J: Array, count: int) -> None:
 
 @implement(place, Converted)
 def place_converted(
-    point: Converted, slam: Slam, state: State, k: int, label: int, z: Array, work: Work[ConvertingRoom]
+    point: Converted, slam: Slam, state: State, k: int, label: int, z: Array, scratch: Scratch[ConvertingArrays]
 ) -> None:
     sensor, pixels, y = slam.sensor, slam.update.pixels, state.x[state.n : state.n + 3]
     convert(sensor, z[0], z[1], z[2], y)
     if pixels.debiasing:
         subtract_bias(sensor, pixels, z[0], z[1], z[2], y)
-    conversion_jacobian(sensor, z[0], z[1], z[2], work.Jz)
-    fill_matrix(work.Jp, 0.0)
+    conversion_jacobian(sensor, z[0], z[1], z[2], scratch.Jz)
+    fill_matrix(scratch.Jp, 0.0)
 
 
 @inner
-def aim_apart(state: State, m: int, clones: int, recency: bool, local: Clones, room: ConvertingRoom) -> None:
+def aim_apart(state: State, m: int, clones: int, recency: bool, parked: Clones, of_update: ConvertingArrays) -> None:
     """``frames`` (clones + 1, 3) <- the poses to which ``delta`` leads, ``turns`` <- d error about each / d delta.
 
     With ``recency`` that of the robot is the identity: most of its ``delta`` is noise of the last motion, which came
     after all older errors.
     """
-    xi = room.poses[3]
+    xi = of_update.poses[3]
     for c in range(clones):
-        q, p = room.at[m + c], 3 + 3 * (m + c)
+        q, p = of_update.at[m + c], 3 + 3 * (m + c)
         for a in range(3):
-            xi[a] = state.x[q + a] + room.delta[p + a]
-        move_pose(local.origin[room.number[c]], xi, room.frames[c])
-        left_jacobian(xi, room.turns[c])
-    move_pose(state.x[:3], room.delta[:3], room.frames[clones])
+            xi[a] = state.x[q + a] + of_update.delta[p + a]
+        move_pose(parked.origin[of_update.number[c]], xi, of_update.frames[c])
+        left_jacobian(xi, of_update.turns[c])
+    move_pose(state.x[:3], of_update.delta[:3], of_update.frames[clones])
     fill(xi, 0.0)
-    left_jacobian(xi if recency else room.delta[:3], room.turns[clones])
+    left_jacobian(xi if recency else of_update.delta[:3], of_update.turns[clones])
 
 
 @inner
-def aim_chained(state: State, m: int, clones: int, local: Clones, room: ConvertingRoom) -> None:
+def aim_chained(state: State, m: int, clones: int, parked: Clones, of_update: ConvertingArrays) -> None:
     """The same in the chain; ``delta`` of the poses <- C delta, ``links`` (clones + 1, 3, 3) <- B."""
-    whole, step, last, J = room.poses[0], room.poses[1], room.poses[2], room.three[0]
-    whole_on, last_on = room.poses[3], room.poses[4]
+    whole, step, last, J = of_update.poses[0], of_update.poses[1], of_update.poses[2], of_update.three[0]
+    whole_on, last_on = of_update.poses[3], of_update.poses[4]
     fill(whole, 0.0)
     fill(last, 0.0)
     for c in range(clones + 1):
-        p, before = _place(m, c, clones), _place(m, room.on[0] if c == clones else c - 1, clones)
+        p, before = _place(m, c, clones), _place(m, of_update.on[0] if c == clones else c - 1, clones)
         if c == clones:
             copy(whole_on, whole)
             copy(last_on, last)
         for a in range(3):
-            step[a] = room.delta[p + a] - last[a]
-            last[a] = room.delta[p + a]
+            step[a] = of_update.delta[p + a] - last[a]
+            last[a] = of_update.delta[p + a]
         left_jacobian(step, J)
-        _turn_link(whole, J, room.links[c])
+        _turn_link(whole, J, of_update.links[c])
         for a in range(3):
-            room.delta[p + a] = room.delta[before + a] if c > 0 else 0.0
+            of_update.delta[p + a] = of_update.delta[before + a] if c > 0 else 0.0
             for b in range(3):
-                room.delta[p + a] += room.links[c, a, b] * step[b]
+                of_update.delta[p + a] += of_update.links[c, a, b] * step[b]
         _move_on(whole, step)
-        _compose(whole, state.x[:3] if c == clones else local.origin[room.number[c]], room.frames[c])
-        if c == room.on[0]:
+        _compose(whole, state.x[:3] if c == clones else parked.origin[of_update.number[c]], of_update.frames[c])
+        if c == of_update.on[0]:
             copy(whole, whole_on)
             copy(last, last_on)
-        fill_matrix(room.turns[c], 0.0)
+        fill_matrix(of_update.turns[c], 0.0)
         for a in range(3):
-            room.turns[c, a, a] = 1.0
+            of_update.turns[c, a, a] = 1.0
 
 
 @inner
-def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
-    """``delta`` of the poses, in the places of the rows of ``room``, <- C^-1 delta."""
-    step, last, total, last_on, total_on = room.poses[0], room.poses[1], room.poses[2], room.poses[3], room.poses[4]
+def unchain(delta: Array, m: int, clones: int, of_update: ConvertingArrays) -> None:
+    """``delta`` of the poses, in the places of the rows of ``of_update``, <- C^-1 delta."""
+    step, last, total, last_on, total_on = (
+        of_update.poses[0],
+        of_update.poses[1],
+        of_update.poses[2],
+        of_update.poses[3],
+        of_update.poses[4],
+    )
     fill(last, 0.0)
     fill(total, 0.0)
     for c in range(clones + 1):
-        p, B = _place(m, c, clones), room.links[c]
+        p, B = _place(m, c, clones), of_update.links[c]
         if c == clones:
             copy(last_on, last)
             copy(total_on, total)
@@ -341,13 +347,13 @@ def unchain(delta: Array, m: int, clones: int, room: ConvertingRoom) -> None:
         total[0] += scale * (B[1, 1] * x - B[0, 1] * y)
         total[1] += scale * (B[0, 0] * y - B[1, 0] * x)
         copy(total, delta[p : p + 3])
-        if c == room.on[0]:
+        if c == of_update.on[0]:
             copy(last, last_on)
             copy(total, total_on)
 
 
 @inner
-def cast_columns(rows: Array, count: int, at: Indices, m: int, clones: int, room: ConvertingRoom) -> None:
+def cast_columns(rows: Array, count: int, at: Indices, m: int, clones: int, of_update: ConvertingArrays) -> None:
     """``rows`` (count, n) <- rows C'; ``at`` says where the landmarks, and then the clones, are among the columns."""
     for i in range(count):
         row = rows[i]
@@ -356,9 +362,9 @@ def cast_columns(rows: Array, count: int, at: Indices, m: int, clones: int, room
             q = 0 if c == clones else at[m + c]
             if c == clones:
                 u, v = u_on, v_on
-            u, v = _link(room.links[c], (row[q], row[q + 1], row[q + 2]), u, v)
+            u, v = _link(of_update.links[c], (row[q], row[q + 1], row[q + 2]), u, v)
             row[q], row[q + 1], row[q + 2] = v
-            if c == room.on[0]:
+            if c == of_update.on[0]:
                 u_on, v_on = u, v
 
 
@@ -375,31 +381,31 @@ def _link(B: Array, here: Triple, last: Triple, cast: Triple) -> tuple[Triple, T
 
 
 @inner
-def cast_state(state: State, m: int, clones: int, room: ConvertingRoom) -> None:
+def cast_state(state: State, m: int, clones: int, of_update: ConvertingArrays) -> None:
     """P (n, n) <- C P C', and its gathered ``rows`` with it."""
     P, n = state.P, state.n
-    cast_columns(room.rows.T, n, room.place, m, clones, room)
-    cast_columns(room.rows, 3 + 3 * (m + clones), room.at, m, clones, room)
-    copy_matrix(room.rows[:3, :n], P[:3, :n])
+    cast_columns(of_update.rows.T, n, of_update.place, m, clones, of_update)
+    cast_columns(of_update.rows, 3 + 3 * (m + clones), of_update.at, m, clones, of_update)
+    copy_matrix(of_update.rows[:3, :n], P[:3, :n])
     for c in range(clones):
-        o, p = room.at[m + c], 3 + 3 * (m + c)
-        replace_rows(P, n, o, room.rows[p : p + 3], room.rows[p : p + 3, o : o + 3])
+        o, p = of_update.at[m + c], 3 + 3 * (m + c)
+        replace_rows(P, n, o, of_update.rows[p : p + 3], of_update.rows[p : p + 3, o : o + 3])
 
 
 @inner
-def move_chain(state: State, m: int, clones: int, local: Clones, work: Work[ConvertingRoom]) -> None:
-    """The robot and all clones <- moved by the error ``work.delta`` (n,) about where they were aimed from."""
-    room, x = work.room, state.x
-    copy(work.delta[:3], room.delta[:3])
+def move_chain(state: State, m: int, clones: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> None:
+    """The robot and all clones <- moved by the error ``scratch.delta`` (n,) about where they were aimed from."""
+    of_update, x = scratch.of_update, state.x
+    copy(scratch.delta[:3], of_update.delta[:3])
     for c in range(clones):
-        p, q = 3 + 3 * (m + c), room.at[m + c]
-        copy(work.delta[q : q + 3], room.delta[p : p + 3])
+        p, q = 3 + 3 * (m + c), of_update.at[m + c]
+        copy(scratch.delta[q : q + 3], of_update.delta[p : p + 3])
         fill(x[q : q + 3], 0.0)
-    unchain(room.delta, m, clones, room)
-    aim_chained(state, m, clones, local, room)
+    unchain(of_update.delta, m, clones, of_update)
+    aim_chained(state, m, clones, parked, of_update)
     for c in range(clones):
-        copy(room.frames[c], local.origin[room.number[c]])
-    copy(room.frames[clones], x[:3])
+        copy(of_update.frames[c], parked.origin[of_update.number[c]])
+    copy(of_update.frames[clones], x[:3])
 
 
 @inner

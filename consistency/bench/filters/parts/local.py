@@ -46,12 +46,12 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     append,
     landmark_width,
+    make_covariance_arrays,
     make_factors,
-    make_local,
     prepare,
     settle,
 )
-from consistency.bench.filters.kernel.update_steps import Work, across, gather_rows, mirror, state_index
+from consistency.bench.filters.kernel.update_steps import Scratch, across, gather_rows, mirror, state_index
 from consistency.referee.types import Array, Indices
 
 
@@ -71,12 +71,12 @@ def to_base(covariance: NamedTuple, x: Array, p: int, robot: Array, landmark: Ar
 
 
 @inner
-def add_label(label: int, offset: int, n: int, b: int, w: int, local: Factors) -> None:
+def add_label(label: int, offset: int, n: int, b: int, w: int, factors: Factors) -> None:
     """A block of the whole state, at ``offset``, is at ``n`` of the active part and at ``b`` of the base.
 
     Of what is not a landmark the ``label`` is -1 - offset.
     """
-    local.label[(n - 3) // w], local.base[(b - 3) // w] = label, offset
+    factors.label[(n - 3) // w], factors.base[(b - 3) // w] = label, offset
 
 
 @inner
@@ -86,107 +86,107 @@ def _entry(P: Array, i: int, j: int) -> float:
 
 
 @inner
-def append_rows(slam: Slam, state: State, label: int, local: Factors, Jp: Array) -> None:
+def append_rows(slam: Slam, state: State, label: int, factors: Factors, Jp: Array) -> None:
     """A landmark that begins at its offset in the active part, with Jacobian Jp (w, 3) by the robot."""
-    w, o, Phi = landmark_width(slam.landmark), state.offset[label], local.Phi
+    w, o, Phi = landmark_width(slam.landmark), state.offset[label], factors.Phi
     if state.base == 0:
         return
     for a in range(w):
         for j in range(state.base):
             Phi[o + a, j] = across(Phi, j, Jp, a)
-    local.label[(o - 3) // w] = label
+    factors.label[(o - 3) // w] = label
 
 
 @inner
-def take_out(covariance: NamedTuple, w: int, whole: State, n: int, local: Factors) -> None:
-    """The robot and the blocks that ``local.base`` lists, ``n`` variables in all, become active and the base."""
+def take_out(covariance: NamedTuple, w: int, whole: State, n: int, factors: Factors) -> None:
+    """The robot and the blocks that ``factors.base`` lists, ``n`` variables in all, become active and the base."""
     x, P = whole.x, whole.P
     for i in range(n):
-        p = state_index(w, i, local.base)
-        local.x[i] = x[p]
+        p = state_index(w, i, factors.base)
+        factors.x[i] = x[p]
         for j in range(i, n):
-            local.P[i, j] = _entry(P, p, state_index(w, j, local.base))
-            local.Psi[i, j] = 0.0
-        fill(local.Phi[i, :n], 0.0)
-        local.theta[i] = 0.0
-    start_rows(covariance, x, 3, 0, 0, 0, local.Phi)
+            factors.P[i, j] = _entry(P, p, state_index(w, j, factors.base))
+            factors.Psi[i, j] = 0.0
+        fill(factors.Phi[i, :n], 0.0)
+        factors.theta[i] = 0.0
+    start_rows(covariance, x, 3, 0, 0, 0, factors.Phi)
     for i in range(3, n, w):
-        start_rows(covariance, x, w, state_index(w, i, local.base), i, i, local.Phi)
-    mirror(local.P)
+        start_rows(covariance, x, w, state_index(w, i, factors.base), i, i, factors.Phi)
+    mirror(factors.P)
 
 
 @inner
-def wake(covariance: NamedTuple, w: int, whole: State, n: int, b: int, more: int, local: Factors) -> None:
-    """The last ``more`` variables that ``local.base`` lists join, at ``n`` in the active part, ``b`` in the base."""
-    x0, P0, x, P, Phi, Psi = whole.x, whole.P, local.x, local.P, local.Phi, local.Psi
-    D, G = local.cross[:more, :b], local.gain[:more, :b]
+def wake(covariance: NamedTuple, w: int, whole: State, n: int, b: int, more: int, factors: Factors) -> None:
+    """The last ``more`` variables that ``factors.base`` lists join, at ``n`` in the active part, ``b`` in the base."""
+    x0, P0, x, P, Phi, Psi = whole.x, whole.P, factors.x, factors.P, factors.Phi, factors.Psi
+    D, G = factors.cross[:more, :b], factors.gain[:more, :b]
     for i in range(more):
-        p = state_index(w, b + i, local.base)
+        p = state_index(w, b + i, factors.base)
         x[n + i] = x0[p]
         for j in range(b):
-            D[i, j] = _entry(P0, p, state_index(w, j, local.base))
+            D[i, j] = _entry(P0, p, state_index(w, j, factors.base))
         for j in range(i, more):
-            P[n + i, n + j] = _entry(P0, p, state_index(w, b + j, local.base))
+            P[n + i, n + j] = _entry(P0, p, state_index(w, b + j, factors.base))
     for j in range(3, b, w):
-        to_base(covariance, x0, local.base[(j - 3) // w], D[:, :3], D[:, j : j + 2])
+        to_base(covariance, x0, factors.base[(j - 3) // w], D[:, :3], D[:, j : j + 2])
     times_symmetric(D, Psi[:b, :b], G)
     fill_matrix(P[:n, n : n + more], 0.0)
     add_times_transposed(1.0, Phi[:n, :b], D, P[:n, n : n + more])
     add_times_transposed(-1.0, G, D, P[n : n + more, n : n + more])
     for i in range(more):
         for j in range(b):
-            x[n + i] += D[i, j] * local.theta[j]
+            x[n + i] += D[i, j] * factors.theta[j]
             Phi[n + i, j] = -G[i, j]
     fill_matrix(Phi[: n + more, b : b + more], 0.0)
     fill_matrix(Psi[: b + more, b : b + more], 0.0)
-    fill(local.theta[b : b + more], 0.0)
+    fill(factors.theta[b : b + more], 0.0)
     for i in range(0, more, w):
-        start_rows(covariance, x0, w, local.base[(b + i - 3) // w], n + i, b + i, Phi)
+        start_rows(covariance, x0, w, factors.base[(b + i - 3) // w], n + i, b + i, Phi)
 
 
 @inner
-def join(slam: Slam, whole: State, n: int, b: int, local: Factors) -> None:
+def join(slam: Slam, whole: State, n: int, b: int, factors: Factors) -> None:
     """x, P of the ``whole`` <- what the active part and the factors say; the passive part is settled."""
     w, x = landmark_width(slam.landmark), whole.x
-    x0 = local.rows[:b, : whole.n]
-    gather_rows(whole.P, whole.n, w, local.base, (b - 3) // w, x0)
-    owed = local.owed[:b, : whole.n]
+    x0 = factors.rows[:b, : whole.n]
+    gather_rows(whole.P, whole.n, w, factors.base, (b - 3) // w, x0)
+    owed = factors.owed[:b, : whole.n]
     for j in range(3, b, w):
-        to_base(slam.covariance, x, local.base[(j - 3) // w], x0[:3].T, x0[j : j + 2].T)
-    symmetric_times(local.Psi[:b, :b], x0, owed)
+        to_base(slam.covariance, x, factors.base[(j - 3) // w], x0[:3].T, x0[j : j + 2].T)
+    symmetric_times(factors.Psi[:b, :b], x0, owed)
     add_symmetric_product(-1.0, x0, owed, whole.P[: whole.n, : whole.n])
-    add_transposed_times(x0, local.theta[:b], x[: whole.n])
-    _settle(w, whole, n, b, local)
+    add_transposed_times(x0, factors.theta[:b], x[: whole.n])
+    _settle(w, whole, n, b, factors)
 
 
 @inner
-def _settle(w: int, whole: State, n: int, b: int, local: Factors) -> None:
+def _settle(w: int, whole: State, n: int, b: int, factors: Factors) -> None:
     """Rows and columns of the active variables in the whole state."""
-    P, at, beyond = whole.P, local.label, local.owed[:n, : whole.n]
+    P, at, beyond = whole.P, factors.label, factors.owed[:n, : whole.n]
     for i in range((n - 3) // w):
         p = whole.offset[at[i]] if at[i] >= 0 else at[i]
         at[i] = p if p >= 0 else -1 - p
-    product(local.Phi[:n, :b], local.rows[:b, : whole.n], beyond)
-    _settle_rows(whole, 3, 0, 0, beyond, local)
+    product(factors.Phi[:n, :b], factors.rows[:b, : whole.n], beyond)
+    _settle_rows(whole, 3, 0, 0, beyond, factors)
     for i in range(3, n, w):
-        _settle_rows(whole, w, i, state_index(w, i, at), beyond, local)
+        _settle_rows(whole, w, i, state_index(w, i, at), beyond, factors)
     for i in range(n):
         p = state_index(w, i, at)
         for j in range(i, n):
             q = state_index(w, j, at)
-            P[min(p, q), max(p, q)] = local.P[i, j]
-    copy_matrix(local.P[:3, :3], P[:3, :3])
+            P[min(p, q), max(p, q)] = factors.P[i, j]
+    copy_matrix(factors.P[:3, :3], P[:3, :3])
 
 
 @inner
-def _settle_rows(whole: State, width: int, i: int, p: int, across: Array, local: Factors) -> None:
+def _settle_rows(whole: State, width: int, i: int, p: int, across: Array, factors: Factors) -> None:
     """Those of the ``width`` variables at ``i`` of the active part and ``p`` of the whole."""
     for j in range(p):
         for a in range(width):
             whole.P[j, p + a] = across[i + a, j]
     for a in range(width):
         copy(across[i + a, p + a :], whole.P[p + a, p + a : whole.n])
-        whole.x[p + a] = local.x[i + a]
+        whole.x[p + a] = factors.x[i + a]
 
 
 LOCAL_FROM = 100  # variables in the state from which local updating is tried; measured, as the next three
@@ -206,7 +206,7 @@ class Local(NamedTuple):
     start: int
 
 
-@implement(make_local, Local)
+@implement(make_covariance_arrays, Local)
 def make_local_factors(covariance: Local, w: int, n: int, steps: int, n_landmarks: int) -> Factors:
     if n < covariance.start:
         return make_factors(3, 3, 1)
@@ -216,38 +216,38 @@ def make_local_factors(covariance: Local, w: int, n: int, steps: int, n_landmark
 
 @implement(prepare, Local)
 def prepare_active(
-    covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, local: Factors
+    covariance: Local, slam: Slam, whole: State, state: State, labels: Indices, factors: Factors
 ) -> tuple[State, State]:
     """The active part that a step works on, settled first where that is due, and split where it begins."""
     w, home, offset = landmark_width(slam.landmark), whole.offset, state.offset
     x, P, n, b = state.x, state.P, state.n, state.base
-    if b > 0 and is_due(whole.n, n, b, w * len(labels), local):
-        join(slam, whole, n, b, local)
-        count_settling(whole.n, n, b, local)
+    if b > 0 and is_due(whole.n, n, b, w * len(labels), factors):
+        join(slam, whole, n, b, factors)
+        count_settling(whole.n, n, b, factors)
         x, P, n, b = whole.x, whole.P, whole.n, 0
         copy(home, offset)
-    if b == 0 and n >= covariance.start and may_split(w, len(labels), local):
-        n = split(covariance, w, whole, labels, offset, local)
-        start_counting(n, local)
-        x, P, b = local.x, local.P, n
+    if b == 0 and n >= covariance.start and may_split(w, len(labels), factors):
+        n = split(covariance, w, whole, labels, offset, factors)
+        start_counting(n, factors)
+        x, P, b = factors.x, factors.P, n
     if b > 0:
-        more = activate(covariance, w, whole, labels, State(x, P, n, b, offset), local)
+        more = activate(covariance, w, whole, labels, State(x, P, n, b, offset), factors)
         n, b = n + more, b + more
-        count(whole.n, n, b, more, w * len(labels), local)
+        count(whole.n, n, b, more, w * len(labels), factors)
     return whole, State(x, P, n, b, offset)
 
 
 @implement(append, Local)
 def append_factors(
-    covariance: Local, slam: Slam, state: State, label: int, local: Factors, work: Work[NamedTuple]
+    covariance: Local, slam: Slam, state: State, label: int, factors: Factors, scratch: Scratch[NamedTuple]
 ) -> None:
-    append_rows(slam, state, label, local, work.Jp)
+    append_rows(slam, state, label, factors, scratch.Jp)
 
 
 @implement(settle, Local)
-def settle_active(covariance: Local, slam: Slam, whole: State, state: State, local: Factors) -> None:
+def settle_active(covariance: Local, slam: Slam, whole: State, state: State, factors: Factors) -> None:
     if state.base > 0:
-        join(slam, whole, state.n, state.base, local)
+        join(slam, whole, state.n, state.base, factors)
 
 
 @implement(start_rows, Local)
@@ -271,7 +271,7 @@ def to_relative_base(covariance: Local, x: Array, p: int, robot: Array, landmark
 
 
 @inner
-def split(covariance: Local, w: int, whole: State, labels: Indices, offset: Indices, local: Factors) -> int:
+def split(covariance: Local, w: int, whole: State, labels: Indices, offset: Indices, factors: Factors) -> int:
     """The robot and the known ones of ``labels`` (m,) become active and the base; returns their number of variables.
 
     ``offset`` (n_landmarks,) <- that of each landmark in the active part, or -1.
@@ -280,24 +280,24 @@ def split(covariance: Local, w: int, whole: State, labels: Indices, offset: Indi
     n = 3
     for label in labels:
         if whole.offset[label] >= 0:
-            add_label(label, whole.offset[label], n, n, w, local)
+            add_label(label, whole.offset[label], n, n, w, factors)
             offset[label] = n
             n += w
-    take_out(covariance, w, whole, n, local)
+    take_out(covariance, w, whole, n, factors)
     return n
 
 
 @inner
-def activate(covariance: Local, w: int, whole: State, labels: Indices, active: State, local: Factors) -> int:
+def activate(covariance: Local, w: int, whole: State, labels: Indices, active: State, factors: Factors) -> int:
     """Passive ones of ``labels`` (m,) become active and join the base; returns by how many variables both grow."""
     more, n, b, home = 0, active.n, active.base, whole.offset
     for label in labels:
         if home[label] >= 0 and active.offset[label] < 0:
-            add_label(label, home[label], n + more, b + more, w, local)
+            add_label(label, home[label], n + more, b + more, w, factors)
             active.offset[label] = n + more
             more += w
     if more > 0:
-        wake(covariance, w, whole, n, b, more, local)
+        wake(covariance, w, whole, n, b, more, factors)
     return more
 
 
@@ -314,47 +314,47 @@ def _work(n: int, b: int, seen: int) -> float:
 
 
 @inner
-def may_split(w: int, seen: int, local: Factors) -> bool:
+def may_split(w: int, seen: int, factors: Factors) -> bool:
     """Whether the next steps are to be local; counts the pause down."""
-    tally = local.tally
+    tally = factors.tally
     tally[LEFT] = max(tally[LEFT] - 1.0, 0.0)
-    return tally[LEFT] == 0.0 and 2 * (3 + w * seen) <= len(local.x)
+    return tally[LEFT] == 0.0 and 2 * (3 + w * seen) <= len(factors.x)
 
 
 @inner
-def start_counting(b: int, local: Factors) -> None:
+def start_counting(b: int, factors: Factors) -> None:
     """After a split with a base of ``b`` variables."""
-    tally = local.tally
+    tally = factors.tally
     tally[STEPS] = tally[SPENT] = tally[DENSE] = 0.0
     tally[FIRST] = b
 
 
 @inner
-def count(whole: int, n: int, b: int, more: int, seen: int, local: Factors) -> None:
+def count(whole: int, n: int, b: int, more: int, seen: int, factors: Factors) -> None:
     """A local step in which ``more`` variables became active."""
-    tally = local.tally
+    tally = factors.tally
     tally[STEPS] += 1.0
     tally[SPENT] += _work(n, b, seen) + (OVERHEAD + 4.0 * more * b * (n + b) if more > 0 else 0.0)
     tally[DENSE] += float(seen) * whole * whole
 
 
 @inner
-def is_due(whole: int, n: int, b: int, seen: int, local: Factors) -> bool:
+def is_due(whole: int, n: int, b: int, seen: int, factors: Factors) -> bool:
     """Whether settling now makes the average step cheapest, or the active part has no room for the next.
 
     The average falls until a step costs more than it. What settling costs for each variable that joined since the
     split is paid whenever it is done; waiting spreads what it costs for the first ones over more steps.
     """
-    tally = local.tally
-    if n + seen > len(local.x) or n + b > whole:
+    tally = factors.tally
+    if n + seen > len(factors.x) or n + b > whole:
         return True
     return _work(n, b, seen) * tally[STEPS] - tally[SPENT] > whole * whole * (tally[FIRST] + TRAFFIC)
 
 
 @inner
-def count_settling(whole: int, n: int, b: int, local: Factors) -> None:
+def count_settling(whole: int, n: int, b: int, factors: Factors) -> None:
     """Whether the stretch paid; if not, a pause."""
-    tally = local.tally
+    tally = factors.tally
     settling = whole * whole * (b + TRAFFIC) + 2.0 * whole * b * (n + b)
     paid = tally[SPENT] + settling < tally[DENSE]
     tally[LONG] = 0.0 if paid else max(4.0 * tally[LONG], PAUSE)

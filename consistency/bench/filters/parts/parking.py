@@ -20,14 +20,14 @@ from consistency.bench.filters.kernel.part_functions import (
     State,
     append,
     held_at,
+    make_covariance_arrays,
     make_factors,
-    make_local,
     prepare,
     settle,
     spare_width,
     withhold,
 )
-from consistency.bench.filters.kernel.update_steps import Work, gather_rows, replace_rows
+from consistency.bench.filters.kernel.update_steps import Scratch, gather_rows, replace_rows
 from consistency.bench.filters.parts.invariant_pose import left_jacobian, move_pose
 from consistency.bench.filters.parts.local import LOCAL_FROM, add_label, append_rows, join, take_out, wake
 from consistency.referee.types import Array, Indices
@@ -83,7 +83,7 @@ def clones_width(covariance: Parking, steps: int, n_landmarks: int) -> int:
     return 3 * _most_clones(covariance, steps, n_landmarks)
 
 
-@implement(make_local, Parking)
+@implement(make_covariance_arrays, Parking)
 def make_clones(covariance: Parking, w: int, n: int, steps: int, n_landmarks: int) -> Clones:
     most = _most_clones(covariance, steps, n_landmarks)
     is_local = most > 0 and n >= covariance.start
@@ -111,242 +111,242 @@ def make_clones(covariance: Parking, w: int, n: int, steps: int, n_landmarks: in
 
 @implement(prepare, Parking)
 def prepare_parked(
-    covariance: Parking, slam: Slam, whole: State, state: State, labels: Indices, local: Clones
+    covariance: Parking, slam: Slam, whole: State, state: State, labels: Indices, parked: Clones
 ) -> tuple[State, State]:
     """Parks first where that is due; settles the active part before that, or where it has grown too large."""
-    step = local.step[0]
-    local.step[0] = step + 1
+    step = parked.step[0]
+    parked.step[0] = step + 1
     if covariance.every > 0 and step > 0 and step % covariance.every == 0:
-        local.due[0] = 1
-    due = local.due[0] == 1 and not _must_wait(covariance, step, local)
+        parked.due[0] = 1
+    due = parked.due[0] == 1 and not _must_wait(covariance, step, parked)
     if due:
-        local.due[0] = 0
-    due = due and _is_any_idle(covariance, whole, step, local)
-    if state.base > 0 and (due or _is_crowded(whole, state, labels, local)):
-        state = _joined(slam, whole, state, local)
+        parked.due[0] = 0
+    due = due and _is_any_idle(covariance, whole, step, parked)
+    if state.base > 0 and (due or _is_crowded(whole, state, labels, parked)):
+        state = _joined(slam, whole, state, parked)
     if due:
-        whole = _park(covariance, whole, step, local)
+        whole = _park(covariance, whole, step, parked)
         state = State(whole.x, whole.P, whole.n, 0, state.offset)
     if state.base == 0:
-        needs_whole = _needs_whole(covariance, state, labels, local)
-        if not needs_whole and whole.n >= covariance.start and _is_worth_it(whole, labels, local):
-            state = _split(covariance, whole, state.offset, local)
+        needs_whole = _needs_whole(covariance, state, labels, parked)
+        if not needs_whole and whole.n >= covariance.start and _is_worth_it(whole, labels, parked):
+            state = _split(covariance, whole, state.offset, parked)
     if state.base > 0:
-        state = _call_back(covariance, whole, state, labels, local)
-        if _needs_whole(covariance, state, labels, local):
-            state = _joined(slam, whole, state, local)
+        state = _call_back(covariance, whole, state, labels, parked)
+        if _needs_whole(covariance, state, labels, parked):
+            state = _joined(slam, whole, state, parked)
     for label in labels:
-        local.earlier[label] = local.seen[label]
-        local.seen[label] = step + 1
+        parked.earlier[label] = parked.seen[label]
+        parked.seen[label] = step + 1
     return whole, state
 
 
 @implement(withhold, Parking)
 def withhold_parked(
-    covariance: Parking, state: State, data: Data, k: int, rejected: Array, again: Array, local: Clones
+    covariance: Parking, state: State, data: Data, k: int, rejected: Array, again: Array, parked: Clones
 ) -> None:
     """What is rejected was not seen, and no return of it is in doubt."""
-    fill(local.doubted, 0)
+    fill(parked.doubted, 0)
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
-        if again[i] and local.of[label] >= 0:
-            unpark(label, state, local)
+        if again[i] and parked.of[label] >= 0:
+            unpark(label, state, parked)
         if rejected[i]:
-            local.seen[label] = local.earlier[label]
-        elif local.of[label] >= 0:
-            _note_doubt(label, local)
+            parked.seen[label] = parked.earlier[label]
+        elif parked.of[label] >= 0:
+            _note_doubt(label, parked)
 
 
 @inner
-def _note_doubt(label: int, local: Clones) -> None:
-    number = local.of[label]
-    local.doubted[number] = max(local.doubted[number], local.doubt[label])
+def _note_doubt(label: int, parked: Clones) -> None:
+    number = parked.of[label]
+    parked.doubted[number] = max(parked.doubted[number], parked.doubt[label])
 
 
 @inner
-def _joined(slam: Slam, whole: State, state: State, local: Clones) -> State:
+def _joined(slam: Slam, whole: State, state: State, parked: Clones) -> State:
     """All variables, after what the active part did to them."""
-    join(slam, whole, state.n, state.base, local.factors)
+    join(slam, whole, state.n, state.base, parked.factors)
     copy(whole.offset, state.offset)
-    copy(local.at, local.here)
+    copy(parked.at, parked.here)
     return State(whole.x, whole.P, whole.n, 0, state.offset)
 
 
 @inner
-def _needs_whole(covariance: Parking, state: State, labels: Indices, local: Clones) -> bool:
+def _needs_whole(covariance: Parking, state: State, labels: Indices, parked: Clones) -> bool:
     """Finds what of the ``labels`` returns in doubt, and whether that takes the whole state."""
-    step, any_doubted = local.step[0] - 1, False
-    fill(local.doubted, 0)
+    step, any_doubted = parked.step[0] - 1, False
+    fill(parked.doubted, 0)
     for label in labels:
-        number = local.of[label]
+        number = parked.of[label]
         if number >= 0:
-            local.doubt[label] = 0
-            if state.P[2, 2] > covariance.adrift or turn_variance(label, state, local) > covariance.doubt:
+            parked.doubt[label] = 0
+            if state.P[2, 2] > covariance.adrift or turn_variance(label, state, parked) > covariance.doubt:
                 any_doubted = True
-                local.doubt[label] = 2 if local.seen[label] == step else 1
-                _note_doubt(label, local)
+                parked.doubt[label] = 2 if parked.seen[label] == step else 1
+                _note_doubt(label, parked)
     return any_doubted and covariance.whole
 
 
 @inner
-def is_new(label: int, local: Clones) -> bool:
+def is_new(label: int, parked: Clones) -> bool:
     """Whether a landmark of this step was not seen in the last one."""
-    return local.step[0] - local.earlier[label] > 1
+    return parked.step[0] - parked.earlier[label] > 1
 
 
 @inner
-def is_out_of_sight(label: int, local: Clones) -> bool:
+def is_out_of_sight(label: int, parked: Clones) -> bool:
     """Whether a landmark in use was not seen in the last step, whatever is seen in this."""
-    step = local.step[0]
-    last = local.earlier[label] if local.seen[label] == step else local.seen[label]
-    return local.of[label] < 0 and step - last > 1
+    step = parked.step[0]
+    last = parked.earlier[label] if parked.seen[label] == step else parked.seen[label]
+    return parked.of[label] < 0 and step - last > 1
 
 
 @inner
-def forget(label: int, state: State, local: Clones) -> None:
+def forget(label: int, state: State, parked: Clones) -> None:
     """Take a landmark in use out of the state, and keep its place for when it is seen again."""
     o = state.offset[label]
-    clear(o, state, local)
+    clear(o, state, parked)
     state.offset[label] = -1 - o
 
 
 @inner
-def turn_variance(label: int, state: State, local: Clones) -> float:
+def turn_variance(label: int, state: State, parked: Clones) -> float:
     """That of the turn since the clone at which a landmark of this step is parked, rad^2."""
-    P, o = state.P, local.here[local.of[label]] + 2
+    P, o = state.P, parked.here[parked.of[label]] + 2
     return float(P[2, 2] + P[o, o] - 2.0 * P[2, o])
 
 
 @inner
-def is_in_doubt(label: int, local: Clones) -> bool:
+def is_in_doubt(label: int, parked: Clones) -> bool:
     """Whether a landmark of this step is parked where the turn since then is little known."""
-    return local.of[label] >= 0 and local.doubted[local.of[label]] > 0
+    return parked.of[label] >= 0 and parked.doubted[parked.of[label]] > 0
 
 
 @implement(append, Parking)
 def append_active(
-    covariance: Parking, slam: Slam, state: State, label: int, local: Clones, work: Work[NamedTuple]
+    covariance: Parking, slam: Slam, state: State, label: int, parked: Clones, scratch: Scratch[NamedTuple]
 ) -> None:
-    local.seen[label] = local.step[0]
-    append_rows(slam, state, label, local.factors, work.Jp)
+    parked.seen[label] = parked.step[0]
+    append_rows(slam, state, label, parked.factors, scratch.Jp)
 
 
 # --- parking -------------------------------------------------------------------------------------
 
 
 @inner
-def _is_idle(covariance: Parking, whole: State, label: int, step: int, local: Clones) -> bool:
-    return whole.offset[label] >= 0 and local.of[label] < 0 and step - local.seen[label] >= covariance.unseen
+def _is_idle(covariance: Parking, whole: State, label: int, step: int, parked: Clones) -> bool:
+    return whole.offset[label] >= 0 and parked.of[label] < 0 and step - parked.seen[label] >= covariance.unseen
 
 
 @inner
-def _must_wait(covariance: Parking, step: int, local: Clones) -> bool:
+def _must_wait(covariance: Parking, step: int, parked: Clones) -> bool:
     last = 0 if covariance.patience else step
-    for label in range(len(local.of)):
-        last = max(last, local.seen[label])
+    for label in range(len(parked.of)):
+        last = max(last, parked.seen[label])
     return 0 < step - last < covariance.unseen
 
 
 @inner
-def _is_any_idle(covariance: Parking, whole: State, step: int, local: Clones) -> bool:
+def _is_any_idle(covariance: Parking, whole: State, step: int, parked: Clones) -> bool:
     idle = False
-    for label in range(len(local.of)):
-        idle = idle or _is_idle(covariance, whole, label, step, local)
+    for label in range(len(parked.of)):
+        idle = idle or _is_idle(covariance, whole, label, step, parked)
     return idle
 
 
 @inner
-def _park(covariance: Parking, whole: State, step: int, local: Clones) -> State:
+def _park(covariance: Parking, whole: State, step: int, parked: Clones) -> State:
     """Idle landmarks at a clone of the pose that has none; the state grows where there is no old place for it."""
     x, P, n = whole.x, whole.P, whole.n
     number = 0
-    while local.uses[number] > 0:
+    while parked.uses[number] > 0:
         number += 1
-    o = local.at[number]
+    o = parked.at[number]
     if o == 0:
         o = n
         n += 3
-    local.at[number] = local.here[number] = o
-    local.made[number] = step
-    for label in range(len(local.of)):
-        if _is_idle(covariance, whole, label, step, local):
-            local.of[label] = number
-            local.uses[number] += 1
-    copy(x[:3], local.origin[number])
+    parked.at[number] = parked.here[number] = o
+    parked.made[number] = step
+    for label in range(len(parked.of)):
+        if _is_idle(covariance, whole, label, step, parked):
+            parked.of[label] = number
+            parked.uses[number] += 1
+    copy(x[:3], parked.origin[number])
     fill(x[o : o + 3], 0.0)
     for a in range(3):
-        copy(P[a, :n], local.rows[a, :n])
-    replace_rows(P, n, o, local.rows, P[:3, :3])
+        copy(P[a, :n], parked.rows[a, :n])
+    replace_rows(P, n, o, parked.rows, P[:3, :3])
     return State(x, P, n, whole.base, whole.offset)
 
 
 @inner
-def unpark(label: int, state: State, local: Clones) -> None:
+def unpark(label: int, state: State, parked: Clones) -> None:
     """A landmark is in use again; a clone that no landmark needs is left as a place for the next."""
-    number = local.of[label]
-    local.of[label] = -1
-    local.uses[number] -= 1
-    if local.uses[number] == 0:
-        clear(local.here[number], state, local)
+    number = parked.of[label]
+    parked.of[label] = -1
+    parked.uses[number] -= 1
+    if parked.uses[number] == 0:
+        clear(parked.here[number], state, parked)
 
 
 @inner
-def clear(o: int, state: State, local: Clones) -> None:
+def clear(o: int, state: State, parked: Clones) -> None:
     """Nothing is left of the block at ``o``."""
-    fill_matrix(local.rows[:3, : state.n], 0.0)
-    replace_rows(state.P, state.n, o, local.rows, local.rows[:, :3])
+    fill_matrix(parked.rows[:3, : state.n], 0.0)
+    replace_rows(state.P, state.n, o, parked.rows, parked.rows[:, :3])
     fill(state.x[o : o + 3], 0.0)
-    fill_matrix(local.factors.Phi[o : o + 3, : state.base], 0.0)
+    fill_matrix(parked.factors.Phi[o : o + 3, : state.base], 0.0)
 
 
 @implement(held_at, Parking)
-def held_at_clone(covariance: Parking, label: int, local: Clones) -> int:
-    return local.at[local.of[label]] if local.of[label] >= 0 else 0
+def held_at_clone(covariance: Parking, label: int, parked: Clones) -> int:
+    return parked.at[parked.of[label]] if parked.of[label] >= 0 else 0
 
 
 # --- local updating ------------------------------------------------------------------------------
 
 
 @inner
-def _is_worth_it(whole: State, labels: Indices, local: Clones) -> bool:
+def _is_worth_it(whole: State, labels: Indices, parked: Clones) -> bool:
     """Whether an active part of robot and landmarks in use, with a base as large, is small beside the whole.
 
     It must have room for what of the ``labels`` is new or called back, each with a clone.
     """
     n, more = 3, 0
-    for label in range(len(local.of)):
-        if whole.offset[label] >= 0 and local.of[label] < 0:
+    for label in range(len(parked.of)):
+        if whole.offset[label] >= 0 and parked.of[label] < 0:
             n += 3
     for label in labels:
         if whole.offset[label] < 0:
             more += 3
-        elif local.of[label] >= 0:
+        elif parked.of[label] >= 0:
             more += 6
-    return n + more <= len(local.factors.x) and 2.0 * WORTH * n <= whole.n
+    return n + more <= len(parked.factors.x) and 2.0 * WORTH * n <= whole.n
 
 
 @inner
-def _is_crowded(whole: State, state: State, labels: Indices, local: Clones) -> bool:
+def _is_crowded(whole: State, state: State, labels: Indices, parked: Clones) -> bool:
     """Whether the next step has no room in the active part, or would cost more than one on the whole."""
     back = new = 0
     for label in labels:
         if whole.offset[label] < 0:
             new += 3
         elif state.offset[label] < 0:
-            back += 6 if local.here[local.of[label]] == 0 else 3
+            back += 6 if parked.here[parked.of[label]] == 0 else 3
     n = state.n + back
-    return n + new > len(local.factors.x) or n + state.base + back > whole.n
+    return n + new > len(parked.factors.x) or n + state.base + back > whole.n
 
 
 @inner
-def _split(covariance: Parking, whole: State, offset: Indices, local: Clones) -> State:
+def _split(covariance: Parking, whole: State, offset: Indices, parked: Clones) -> State:
     """The robot and the landmarks in use become active; ``offset`` (n_landmarks,) <- that of each there, or -1."""
-    f, n = local.factors, 3
+    f, n = parked.factors, 3
     fill(offset, -1)
-    fill(local.here, 0)
-    for label in range(len(local.of)):
+    fill(parked.here, 0)
+    for label in range(len(parked.of)):
         o = whole.offset[label]
-        if o >= 0 and local.of[label] < 0:
+        if o >= 0 and parked.of[label] < 0:
             add_label(label, o, n, n, 3, f)
             offset[label] = n
             n += 3
@@ -355,15 +355,15 @@ def _split(covariance: Parking, whole: State, offset: Indices, local: Clones) ->
 
 
 @inner
-def _call_back(covariance: Parking, whole: State, active: State, labels: Indices, local: Clones) -> State:
+def _call_back(covariance: Parking, whole: State, active: State, labels: Indices, parked: Clones) -> State:
     """Passive ones of ``labels`` (m,), and their clones, become active and join the base."""
-    f, n, b, more = local.factors, active.n, active.base, 0
+    f, n, b, more = parked.factors, active.n, active.base, 0
     for label in labels:
         if whole.offset[label] >= 0 and active.offset[label] < 0:
-            number = local.of[label]
-            if local.here[number] == 0:
-                add_label(-1 - local.at[number], local.at[number], n + more, b + more, 3, f)
-                local.here[number] = n + more
+            number = parked.of[label]
+            if parked.here[number] == 0:
+                add_label(-1 - parked.at[number], parked.at[number], n + more, b + more, 3, f)
+                parked.here[number] = n + more
                 more += 3
             add_label(label, whole.offset[label], n + more, b + more, 3, f)
             active.offset[label] = n + more
@@ -374,24 +374,24 @@ def _call_back(covariance: Parking, whole: State, active: State, labels: Indices
 
 
 @implement(settle, Parking)
-def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, local: Clones) -> None:
+def settle_clones(covariance: Parking, slam: Slam, whole: State, state: State, parked: Clones) -> None:
     """``whole`` <- all variables; a clone <- its pose, with the covariance of the error about that."""
     if state.base > 0:
-        join(slam, whole, state.n, state.base, local.factors)
-    recentre(State(whole.x, whole.P, whole.n, 0, whole.offset), local)
-    for number in range(len(local.at)):
-        if local.uses[number] > 0:
-            copy(local.origin[number], whole.x[local.at[number] : local.at[number] + 3])
+        join(slam, whole, state.n, state.base, parked.factors)
+    recentre(State(whole.x, whole.P, whole.n, 0, whole.offset), parked)
+    for number in range(len(parked.at)):
+        if parked.uses[number] > 0:
+            copy(parked.origin[number], whole.x[parked.at[number] : parked.at[number] + 3])
 
 
 @inner
-def recentre(state: State, local: Clones) -> None:
+def recentre(state: State, parked: Clones) -> None:
     """Each clone of a whole state <- an error of zero about the pose that it has, and the covariance of that error."""
-    x, P, n, rows = state.x, state.P, state.n, local.rows
+    x, P, n, rows = state.x, state.P, state.n, parked.rows
     turn, own, at = matrix(3, 3), matrix(3, 3), integers(1, 0)
-    for number in range(len(local.at)):
-        if local.uses[number] > 0:
-            o = at[0] = local.at[number]
+    for number in range(len(parked.at)):
+        if parked.uses[number] > 0:
+            o = at[0] = parked.at[number]
             left_jacobian(x[o : o + 3], turn)
             gather_rows(P, n, 3, at, 1, rows[3:])
             for i in range(n):
@@ -401,6 +401,6 @@ def recentre(state: State, local: Clones) -> None:
                 for b in range(3):
                     own[a, b] = turn[b, 0] * rows[a, o] + turn[b, 1] * rows[a, o + 1] + turn[b, 2] * rows[a, o + 2]
             replace_rows(P, n, o, rows, own)
-            move_pose(local.origin[number], x[o : o + 3], turn[0])
-            copy(turn[0], local.origin[number])
+            move_pose(parked.origin[number], x[o : o + 3], turn[0])
+            copy(turn[0], parked.origin[number])
             fill(x[o : o + 3], 0.0)

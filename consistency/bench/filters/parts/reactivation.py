@@ -17,7 +17,7 @@ from consistency.bench.filters.kernel.part_functions import (
     robot_frame,
 )
 from consistency.bench.filters.kernel.update_steps import (
-    Work,
+    Scratch,
     add_gram_to_state,
     apply_beyond,
     divide_by_root,
@@ -27,7 +27,7 @@ from consistency.bench.filters.kernel.update_steps import (
 )
 from consistency.bench.filters.parts.converting import (
     Converting,
-    ConvertingRoom,
+    ConvertingArrays,
     aim_apart,
     aim_chained,
     cast_columns,
@@ -52,36 +52,36 @@ def correct_converted(
     k: int,
     m: int,
     has_innovation: bool,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> tuple[int, float, float]:
-    room, clones, chained, total = work.room, 0, False, 0.0  # as foreseen; clones are scratch then
-    if _is_any_parked(m, local, work) or not has_innovation:
-        clones, chained, total = _aim(update, slam, state, data, m, update.leaving_out, local, work)
-        m = work.used[0]
+    of_update, clones, chained, total = scratch.of_update, 0, False, 0.0  # as foreseen; clones are scratch then
+    if _is_any_parked(m, parked, scratch) or not has_innovation:
+        clones, chained, total = _aim(update, slam, state, data, m, update.leaving_out, parked, scratch)
+        m = scratch.used[0]
     if m == 0:
         return 0, np.nan, np.nan
-    code, nis, log_det = divide_by_root(state, 3 * m, work, total)
+    code, nis, log_det = divide_by_root(state, 3 * m, scratch, total)
     if code == 0:
-        _move(state, m, work)
-        apply_beyond(state, 3 * m, local.factors, work)
+        _move(state, m, scratch)
+        apply_beyond(state, 3 * m, parked.factors, scratch)
         if chained:
-            move_chain(state, m, clones, local, work)
+            move_chain(state, m, clones, parked, scratch)
         else:
-            move_pose(state.x[:3], work.delta[:3], room.frames[clones])
-            copy(room.frames[clones], state.x[:3])
+            move_pose(state.x[:3], scratch.delta[:3], of_update.frames[clones])
+            copy(of_update.frames[clones], state.x[:3])
         for i in range(m):
-            if room.clone[i] >= 0 and not _stays(update, work.label[i], state, local):
-                _reactivate(slam, state, work.label[i], local, work)
+            if of_update.clone[i] >= 0 and not _stays(update, scratch.label[i], state, parked):
+                _reactivate(slam, state, scratch.label[i], parked, scratch)
     return code, nis, log_det
 
 
 @inner
-def _stays(update: Converting, label: int, state: State, local: Clones) -> bool:
+def _stays(update: Converting, label: int, state: State, parked: Clones) -> bool:
     """Whether a landmark in doubt, well known in distance, has a turn since its clone that is not, after the update."""
-    rho, most = state.offset[label] + 2, update.unturned if is_new(label, local) else update.held
+    rho, most = state.offset[label] + 2, update.unturned if is_new(label, parked) else update.held
     is_known = state.P[rho, rho] < (update.known * state.x[rho]) ** 2
-    return is_known and is_in_doubt(label, local) and turn_variance(label, state, local) > most
+    return is_known and is_in_doubt(label, parked) and turn_variance(label, state, parked) > most
 
 
 @implement(predict_innovation, Converting)
@@ -92,18 +92,18 @@ def predict_innovation_converted(
     data: Data,
     k: int,
     m: int,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> tuple[int, float]:
     """As far as the update; a chain moves clones and covariance on its way, and they are put back."""
-    if not _is_any_in_doubt(m, local, work) or update.chain == 0:
-        _, _, total = _aim(update, slam, state, data, m, False, local, work)
+    if not _is_any_in_doubt(m, parked, scratch) or update.chain == 0:
+        _, _, total = _aim(update, slam, state, data, m, False, parked, scratch)
         return 0, total
-    x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), local.origin.copy()
-    _, _, total = _aim(update, slam, state, data, m, False, local, work)
+    x, P, origin = state.x[: state.n].copy(), state.P[: state.n, : state.n].copy(), parked.origin.copy()
+    _, _, total = _aim(update, slam, state, data, m, False, parked, scratch)
     copy(x, state.x[: state.n])
     copy_matrix(P, state.P[: state.n, : state.n])
-    copy_matrix(origin, local.origin)
+    copy_matrix(origin, parked.origin)
     return 0, total
 
 
@@ -115,112 +115,116 @@ def _aim(
     data: Data,
     m: int,
     leaving_out: bool,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> tuple[int, bool, float]:
     """A, S and the innovation where the update leads, found by iteration where something was parked.
 
-    Where that does not settle, with ``leaving_out`` ``work`` lists only what was not parked. Returns how many clones
+    Where that does not settle, with ``leaving_out`` ``scratch`` lists only what was not parked. Returns how many clones
     are in it, whether in a chain, and a sum that is finite if all is.
     """
-    room = work.room
-    chained = _is_any_in_doubt(m, local, work) and update.chain > 0
+    of_update = scratch.of_update
+    chained = _is_any_in_doubt(m, parked, scratch) and update.chain > 0
     if chained:
-        recentre(state, local)
-    clones = _gather(state, m, chained, local, work)
-    chained = chained and _iterate(update, slam, state, data, m, clones, update.chain, True, local, work)
+        recentre(state, parked)
+    clones = _gather(state, m, chained, parked, scratch)
+    chained = chained and _iterate(update, slam, state, data, m, clones, update.chain, True, parked, scratch)
     if not chained and clones > 0 and update.passes > 1:
-        is_settled = _iterate(update, slam, state, data, m, clones, update.passes, False, local, work)
+        is_settled = _iterate(update, slam, state, data, m, clones, update.passes, False, parked, scratch)
         if leaving_out and not is_settled:
-            m = _leave_out_parked(m, local, work)
-            clones = _gather(state, m, False, local, work)
+            m = _leave_out_parked(m, parked, scratch)
+            clones = _gather(state, m, False, parked, scratch)
     if clones == 0 or update.passes == 1:
-        fill(room.delta[: 3 + 3 * (m + clones)], 0.0)
-        aim_apart(state, m, clones, update.recency, local, room)
-        _expect(update, slam, state, data, True, m, clones, local, work)
+        fill(of_update.delta[: 3 + 3 * (m + clones)], 0.0)
+        aim_apart(state, m, clones, update.recency, parked, of_update)
+        _expect(update, slam, state, data, True, m, clones, parked, scratch)
     if chained:
-        cast_state(state, m, clones, room)
-    return clones, chained, _innovate(room.rows, state.n + state.base, room.at, m, work)
+        cast_state(state, m, clones, of_update)
+    return clones, chained, _innovate(of_update.rows, state.n + state.base, of_update.at, m, scratch)
 
 
 @inner
-def _leave_out_parked(m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
-    """``work`` lists, of the ``m`` landmarks, those in use; returns how many. The others count as not seen."""
+def _leave_out_parked(m: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> int:
+    """``scratch`` lists, of the ``m`` landmarks, those in use; returns how many. The others count as not seen."""
     left = 0
     for i in range(m):
-        if local.of[work.label[i]] < 0:
-            work.known[left], work.label[left], work.at[left] = work.known[i], work.label[i], work.at[i]
+        if parked.of[scratch.label[i]] < 0:
+            scratch.known[left], scratch.label[left], scratch.at[left] = (
+                scratch.known[i],
+                scratch.label[i],
+                scratch.at[i],
+            )
             left += 1
         else:
-            local.seen[work.label[i]] = local.earlier[work.label[i]]
-    work.used[0] = left
+            parked.seen[scratch.label[i]] = parked.earlier[scratch.label[i]]
+    scratch.used[0] = left
     return left
 
 
 @inner
-def _is_any_parked(m: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
+def _is_any_parked(m: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> bool:
     is_parked = False
     for i in range(m):
-        is_parked = is_parked or local.of[work.label[i]] >= 0
+        is_parked = is_parked or parked.of[scratch.label[i]] >= 0
     return is_parked
 
 
 @inner
-def _is_any_in_doubt(m: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
+def _is_any_in_doubt(m: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> bool:
     in_doubt = False
     for i in range(m):
-        in_doubt = in_doubt or is_in_doubt(work.label[i], local)
+        in_doubt = in_doubt or is_in_doubt(scratch.label[i], parked)
     return in_doubt
 
 
 @inner
-def _gather(state: State, m: int, is_chained: bool, local: Clones, work: Work[ConvertingRoom]) -> int:
+def _gather(state: State, m: int, is_chained: bool, parked: Clones, scratch: Scratch[ConvertingArrays]) -> int:
     """Rows of P and Phi of all that the update involves; returns how many clones that is.
 
     They are those of parked landmarks that are seen, or in a chain all of them in the order of time. There the robot
     hangs on the first with a landmark that was in doubt in the last step, too, or on the last of all.
     """
-    room = work.room
-    clones = _list_all(local, room.number) if is_chained else _list_seen(m, local, work)
+    of_update = scratch.of_update
+    clones = _list_all(parked, of_update.number) if is_chained else _list_seen(m, parked, scratch)
     for i in range(m):
-        room.at[i], room.clone[i] = work.at[i], -1
+        of_update.at[i], of_update.clone[i] = scratch.at[i], -1
         for c in range(clones):
-            if room.number[c] == local.of[work.label[i]]:
-                room.clone[i] = c
-    room.on[0] = clones - 1
+            if of_update.number[c] == parked.of[scratch.label[i]]:
+                of_update.clone[i] = c
+    of_update.on[0] = clones - 1
     for c in range(clones - 1, -1, -1):
-        room.at[m + c] = local.here[room.number[c]]
-        if local.doubted[room.number[c]] == 2:
-            room.on[0] = c
-    gather_all_rows(state, local.factors.Phi, 3, room.at, m + clones, room.rows)
+        of_update.at[m + c] = parked.here[of_update.number[c]]
+        if parked.doubted[of_update.number[c]] == 2:
+            of_update.on[0] = c
+    gather_all_rows(state, parked.factors.Phi, 3, of_update.at, m + clones, of_update.rows)
     return clones
 
 
 @inner
-def _list_seen(m: int, local: Clones, work: Work[ConvertingRoom]) -> int:
+def _list_seen(m: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> int:
     clones = 0
     for i in range(m):
-        number, is_new = local.of[work.label[i]], True
+        number, is_new = parked.of[scratch.label[i]], True
         for c in range(clones):
-            is_new = is_new and work.room.number[c] != number
+            is_new = is_new and scratch.of_update.number[c] != number
         if number >= 0 and is_new:
-            work.room.number[clones] = number
+            scratch.of_update.number[clones] = number
             clones += 1
     return clones
 
 
 @inner
-def _list_all(local: Clones, numbers: Indices) -> int:
+def _list_all(parked: Clones, numbers: Indices) -> int:
     clones, last = 0, -1
     while True:
         found = -1
-        for number in range(len(local.uses)):
-            is_next = local.uses[number] > 0 and local.made[number] > last
-            if is_next and (found < 0 or local.made[number] < local.made[found]):
+        for number in range(len(parked.uses)):
+            is_next = parked.uses[number] > 0 and parked.made[number] > last
+            if is_next and (found < 0 or parked.made[number] < parked.made[found]):
                 found = number
         if found < 0:
             return clones
-        numbers[clones], last = found, local.made[found]
+        numbers[clones], last = found, parked.made[found]
         clones += 1
 
 
@@ -234,55 +238,55 @@ def _iterate(
     clones: int,
     passes: int,
     is_chained: bool,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> bool:
     """Gauss-Newton on what the update involves; returns whether it settled in ``passes``.
 
-    ``room`` has the last linearisation, ``delta`` where it was made.
+    ``of_update`` has the last linearisation, ``delta`` where it was made.
     """
-    room, size, is_settled = work.room, 3 + 3 * (m + clones), False
+    of_update, size, is_settled = scratch.of_update, 3 + 3 * (m + clones), False
     decades, factor, is_raised = 0.0, 1.0, False
     for j in range(m):
-        is_raised = is_raised or (_is_unsure(update, j, local, work) and is_new(work.label[j], local))
-    among, cast, delta = room.among[:size, :size], room.cast[:size, :size], room.delta[:size]
+        is_raised = is_raised or (_is_unsure(update, j, parked, scratch) and is_new(scratch.label[j], parked))
+    among, cast, delta = of_update.among[:size, :size], of_update.cast[:size, :size], of_update.delta[:size]
     for i in range(size):
         for j in range(size):
-            among[i, j] = room.rows[i, state_index(3, j, room.at)]
+            among[i, j] = of_update.rows[i, state_index(3, j, of_update.at)]
     alone = State(state.x, cast, size, 0, state.offset)
     fill(delta, 0.0)
     for i in range(passes):
-        copy(delta, room.before[:size])
+        copy(delta, of_update.before[:size])
         copy_matrix(among, cast)
         if is_chained:
-            aim_chained(state, m, clones, local, room)
-            cast_columns(cast.T, size, room.place, m, clones, room)
-            cast_columns(cast, size, room.place, m, clones, room)
+            aim_chained(state, m, clones, parked, of_update)
+            cast_columns(cast.T, size, of_update.place, m, clones, of_update)
+            cast_columns(cast, size, of_update.place, m, clones, of_update)
         else:
-            aim_apart(state, m, clones, update.recency, local, room)
-        _expect(update, slam, state, data, i == 0, m, clones, local, work)
+            aim_apart(state, m, clones, update.recency, parked, of_update)
+        _expect(update, slam, state, data, i == 0, m, clones, parked, scratch)
         if is_raised:
             if i == 0:
                 decades = update.decades
                 if decades == 0.0:
-                    _innovate(cast, size, room.place, m, work)
-                    decades = _decades(update, m, local, work)
+                    _innovate(cast, size, of_update.place, m, scratch)
+                    decades = _decades(update, m, parked, scratch)
             factor = max(1.0, 10.0 ** (decades - update.cooling * i))
-            _temper(update, m, factor, local, work)
-        total = _innovate(cast, size, room.place, m, work)
-        code, _, _ = divide_by_root(alone, 3 * m, work, total)
+            _temper(update, m, factor, parked, scratch)
+        total = _innovate(cast, size, of_update.place, m, scratch)
+        code, _, _ = divide_by_root(alone, 3 * m, scratch, total)
         if code > 0:
             return False
         fill(delta, 0.0)
-        add_transposed_times(work.A[: 3 * m, :size], work.A[: 3 * m, size], delta)
+        add_transposed_times(scratch.A[: 3 * m, :size], scratch.A[: 3 * m, size], delta)
         if is_chained:
-            unchain(delta, m, clones, room)
-        is_settled = i > 0 and factor == 1.0 and _is_settled(size, room)
+            unchain(delta, m, clones, of_update)
+        is_settled = i > 0 and factor == 1.0 and _is_settled(size, of_update)
         if is_settled:
             break
-    copy(room.before[:size], delta)
+    copy(of_update.before[:size], delta)
     if is_chained:
-        aim_chained(state, m, clones, local, room)
+        aim_chained(state, m, clones, parked, of_update)
     return is_settled
 
 
@@ -313,25 +317,35 @@ def _expect(
     is_first: bool,
     m: int,
     clones: int,
-    local: Clones,
-    work: Work[ConvertingRoom],
+    parked: Clones,
+    scratch: Scratch[ConvertingArrays],
 ) -> None:
     """h and its Jacobians where ``delta`` leads, and the observations there; those of landmarks in use once."""
-    x, room, delta = state.x, work.room, work.room.delta
-    D, B, around = room.three[0], room.three[1], room.poses[0]
+    x, of_update, delta = state.x, scratch.of_update, scratch.of_update.delta
+    D, B, around = of_update.three[0], of_update.three[1], of_update.poses[0]
     for j in range(m):
-        o, h, c = work.at[j], room.h[j], room.clone[j]
+        o, h, c = scratch.at[j], of_update.h[j], of_update.clone[j]
         for a in range(3):
             h[a] = x[o + a] + delta[3 + 3 * j + a]
         if c >= 0:
             copy(h, around)
-            _seen_from(slam, room.frames[c], room.frames[clones], around, h, room.own[j], room.shift[j], D, B)
-            _times(1.0, room.shift[j], room.turns[c], room.by_clone[j])
-            _times(-1.0, room.shift[j], room.turns[clones], room.by_pose[j])
+            _seen_from(
+                slam,
+                of_update.frames[c],
+                of_update.frames[clones],
+                around,
+                h,
+                of_update.own[j],
+                of_update.shift[j],
+                D,
+                B,
+            )
+            _times(1.0, of_update.shift[j], of_update.turns[c], of_update.by_clone[j])
+            _times(-1.0, of_update.shift[j], of_update.turns[clones], of_update.by_pose[j])
         if is_first or c >= 0:
-            i = work.known[j]
+            i = scratch.known[j]
             z, of_d, shift = data.z[i], data.R[i, 2, 2], data.shift[i]
-            observe_range(slam.sensor, update.pixels, z, of_d, shift, h, room.y[j], room.R[j], D)
+            observe_range(slam.sensor, update.pixels, z, of_d, shift, h, of_update.y[j], of_update.R[j], D)
 
 
 @inner
@@ -343,56 +357,56 @@ def _times(weight: float, A: Array, B: Array, C: Array) -> None:
 
 
 @inner
-def _is_unsure(update: Converting, j: int, local: Clones, work: Work[ConvertingRoom]) -> bool:
-    return is_in_doubt(work.label[j], local) if update.decades > 0.0 else work.room.clone[j] >= 0
+def _is_unsure(update: Converting, j: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> bool:
+    return is_in_doubt(scratch.label[j], parked) if update.decades > 0.0 else scratch.of_update.clone[j] >= 0
 
 
 @inner
-def _decades(update: Converting, m: int, local: Clones, work: Work[ConvertingRoom]) -> float:
+def _decades(update: Converting, m: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> float:
     """By which the noise of what is unsure is below the variance that is predicted of it."""
     ratio = 1.0
     for j in range(m):
-        if _is_unsure(update, j, local, work):
+        if _is_unsure(update, j, parked, scratch):
             for a in range(3):
-                ratio = max(ratio, work.S[3 * j + a, 3 * j + a] / work.room.R[j, a, a] - 1.0)
+                ratio = max(ratio, scratch.S[3 * j + a, 3 * j + a] / scratch.of_update.R[j, a, a] - 1.0)
     return float(np.log10(ratio))
 
 
 @inner
-def _temper(update: Converting, m: int, factor: float, local: Clones, work: Work[ConvertingRoom]) -> None:
+def _temper(update: Converting, m: int, factor: float, parked: Clones, scratch: Scratch[ConvertingArrays]) -> None:
     """R of what is unsure, worked out in this pass, is raised."""
     for j in range(m):
-        if _is_unsure(update, j, local, work):
+        if _is_unsure(update, j, parked, scratch):
             for a in range(3):
                 for b in range(3):
-                    work.room.R[j, a, b] *= factor
+                    scratch.of_update.R[j, a, b] *= factor
 
 
 @inner
-def _innovate(rows: Array, width: int, at: Indices, m: int, work: Work[ConvertingRoom]) -> float:
+def _innovate(rows: Array, width: int, at: Indices, m: int, scratch: Scratch[ConvertingArrays]) -> float:
     """A (3 m, width) <- H P of the gathered ``rows``, its next column z - h + H delta, and S <- H P H' + R.
 
     ``at`` says where the landmarks, and then their clones, are among the columns. Returns a sum, finite if all is.
     """
-    room, A, S, delta, finite = work.room, work.A, work.S, work.room.delta, 0.0
+    of_update, A, S, delta, finite = scratch.of_update, scratch.A, scratch.S, scratch.of_update.delta, 0.0
     for j in range(m):
         p = 3 + 3 * j
-        q = 3 + 3 * (m + room.clone[j])
+        q = 3 + 3 * (m + of_update.clone[j])
         for a in range(3):
-            gap = room.y[j, a] - room.h[j, a]
+            gap = of_update.y[j, a] - of_update.h[j, a]
             if a == 0:
                 gap = (gap + np.pi) % (2.0 * np.pi) - np.pi
             out = A[3 * j + a]
-            if room.clone[j] < 0:
+            if of_update.clone[j] < 0:
                 copy(rows[p + a, :width], out[:width])
                 gap += delta[p + a]
             else:
                 for c in range(3):
-                    gap += room.own[j, a, c] * delta[p + c]
-                    gap += room.by_clone[j, a, c] * delta[q + c] + room.by_pose[j, a, c] * delta[c]
-                l0, l1, l2 = room.own[j, a, 0], room.own[j, a, 1], room.own[j, a, 2]
-                q0, q1, q2 = room.by_clone[j, a, 0], room.by_clone[j, a, 1], room.by_clone[j, a, 2]
-                p0, p1, p2 = room.by_pose[j, a, 0], room.by_pose[j, a, 1], room.by_pose[j, a, 2]
+                    gap += of_update.own[j, a, c] * delta[p + c]
+                    gap += of_update.by_clone[j, a, c] * delta[q + c] + of_update.by_pose[j, a, c] * delta[c]
+                l0, l1, l2 = of_update.own[j, a, 0], of_update.own[j, a, 1], of_update.own[j, a, 2]
+                q0, q1, q2 = of_update.by_clone[j, a, 0], of_update.by_clone[j, a, 1], of_update.by_clone[j, a, 2]
+                p0, p1, p2 = of_update.by_pose[j, a, 0], of_update.by_pose[j, a, 1], of_update.by_pose[j, a, 2]
                 for i in range(width):
                     out[i] = (
                         l0 * rows[p, i] + l1 * rows[p + 1, i] + l2 * rows[p + 2, i]
@@ -406,54 +420,54 @@ def _innovate(rows: Array, width: int, at: Indices, m: int, work: Work[Convertin
         for row in range(3 * j + 3):
             for a in range(3):
                 total = 0.0
-                if room.clone[j] < 0:
+                if of_update.clone[j] < 0:
                     total = A[row, o + a]
                 else:
-                    q = at[m + room.clone[j]]
+                    q = at[m + of_update.clone[j]]
                     for c in range(3):
-                        total += A[row, o + c] * room.own[j, a, c] + A[row, q + c] * room.by_clone[j, a, c]
-                        total += A[row, c] * room.by_pose[j, a, c]
-                S[row, 3 * j + a] = total + (room.R[j, row - 3 * j, a] if row >= 3 * j else 0.0)
+                        total += A[row, o + c] * of_update.own[j, a, c] + A[row, q + c] * of_update.by_clone[j, a, c]
+                        total += A[row, c] * of_update.by_pose[j, a, c]
+                S[row, 3 * j + a] = total + (of_update.R[j, row - 3 * j, a] if row >= 3 * j else 0.0)
                 finite += S[row, 3 * j + a]
     return finite
 
 
 @inner
-def _is_settled(size: int, room: ConvertingRoom) -> bool:
+def _is_settled(size: int, of_update: ConvertingArrays) -> bool:
     settled = True
     for j in range(size):
-        settled = settled and abs(room.delta[j] - room.before[j]) <= SETTLED * np.sqrt(room.among[j, j])
+        settled = settled and abs(of_update.delta[j] - of_update.before[j]) <= SETTLED * np.sqrt(of_update.among[j, j])
     return settled
 
 
 @inner
-def _move(state: State, m: int, work: Work[ConvertingRoom]) -> None:
-    """x <- moved by ``work.delta`` <- A' y, but for the robot; P <- P - A' A."""
+def _move(state: State, m: int, scratch: Scratch[ConvertingArrays]) -> None:
+    """x <- moved by ``scratch.delta`` <- A' y, but for the robot; P <- P - A' A."""
     x, n = state.x, state.n
-    A, delta = work.A[: 3 * m, :n], work.delta[:n]
+    A, delta = scratch.A[: 3 * m, :n], scratch.delta[:n]
     fill(delta, 0.0)
-    add_transposed_times(A, work.A[: 3 * m, n + state.base], delta)
+    add_transposed_times(A, scratch.A[: 3 * m, n + state.base], delta)
     add_gram_to_state(-1.0, A, state.P, n)
     for i in range(3, n):
         x[i] += delta[i]
 
 
 @inner
-def _reactivate(slam: Slam, state: State, label: int, local: Clones, work: Work[ConvertingRoom]) -> None:
+def _reactivate(slam: Slam, state: State, label: int, parked: Clones, scratch: Scratch[ConvertingArrays]) -> None:
     """A landmark that was parked, in the frame of the sensor again."""
-    x, P, n, base, room, Phi = state.x, state.P, state.n, state.base, work.room, local.factors.Phi
-    J, shift, D, turned = room.three[0], room.three[1], room.three[2], room.three[3]
-    there, clone = room.poses[0], room.poses[1]
-    number, o = local.of[label], state.offset[label]
-    q = local.here[number]
-    move_pose(local.origin[number], x[q : q + 3], clone)
+    x, P, n, base, of_update, Phi = state.x, state.P, state.n, state.base, scratch.of_update, parked.factors.Phi
+    J, shift, D, turned = of_update.three[0], of_update.three[1], of_update.three[2], of_update.three[3]
+    there, clone = of_update.poses[0], of_update.poses[1]
+    number, o = parked.of[label], state.offset[label]
+    q = parked.here[number]
+    move_pose(parked.origin[number], x[q : q + 3], clone)
     _seen_from(slam, clone, x[:3], x[o : o + 3], there, J, shift, D, turned)
     copy(there, x[o : o + 3])
     left_jacobian(x[q : q + 3], D)
     _times(1.0, shift, D, turned)
-    room.at[0], room.at[1] = o, q
-    gather_all_rows(state, Phi, 3, room.at, 2, room.rows)
-    rows, out = room.rows, work.rows
+    of_update.at[0], of_update.at[1] = o, q
+    gather_all_rows(state, Phi, 3, of_update.at, 2, of_update.rows)
+    rows, out = of_update.rows, scratch.rows
     for i in range(n + base):
         for a in range(3):
             total = 0.0
@@ -469,4 +483,4 @@ def _reactivate(slam: Slam, state: State, label: int, local: Clones, work: Work[
                 total += J[b, c] * out[a, o + c] + turned[b, c] * out[a, q + c] - shift[b, c] * out[a, c]
             D[a, b] = total
     replace_rows(P, n, o, out, D)
-    unpark(label, state, local)
+    unpark(label, state, parked)

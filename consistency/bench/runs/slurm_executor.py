@@ -112,7 +112,11 @@ class SlurmExecutor(Executor):
                     del self._jobs[job]
                 elif job.done() and future.set_running_or_notify_cancel():
                     del self._jobs[job]
-                    self._settle(job, future)
+                    try:
+                        future.set_result(job.result())
+                    except Exception as error:
+                        self._died += 1
+                        future.set_exception(error)
 
     def _send(self, executor: Any) -> None:
         calls: list[Call] = []
@@ -129,13 +133,6 @@ class SlurmExecutor(Executor):
                 future.set_exception(refusal)
         else:
             self._jobs |= dict(zip(jobs, (future for future, _ in calls), strict=True))
-
-    def _settle(self, job: Any, future: Future[Any]) -> None:
-        try:
-            future.set_result(job.result())
-        except Exception as error:
-            self._died += 1
-            future.set_exception(error)
 
 
 def options_of(texts: Sequence[str]) -> dict[str, Any]:

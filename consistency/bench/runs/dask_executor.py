@@ -11,7 +11,7 @@ from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import dask
 from distributed import Client, LocalCluster, Security
@@ -92,7 +92,9 @@ class DaskExecutor(Executor):
                 if client is not None:
                     _close(client)
                 if time.monotonic() >= end:
-                    self._give_up("cannot be reached" if client is None else "has had no worker", error)
+                    what = "cannot be reached" if client is None else "has had no worker"
+                    sentence = f"the scheduler {self.scheduler} {what} for {self.wait:g} s"
+                    raise InputError(sentence) from ConnectionError(str(error))
                 time.sleep(min(PAUSE, self.wait))
             except (ValueError, TypeError, RuntimeError) as error:  # of the address, or of certificates
                 reason = one_line(f"{type(error).__name__}: {error}", 200)
@@ -119,9 +121,6 @@ class DaskExecutor(Executor):
             n_workers=worker_count(self.jobs), threads_per_worker=1, memory_limit=None, host="127.0.0.1",
             dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
         )  # fmt: skip
-
-    def _give_up(self, what: str, error: Exception) -> NoReturn:
-        raise InputError(f"the scheduler {self.scheduler} {what} for {self.wait:g} s") from ConnectionError(str(error))
 
 
 def _close(client: Client) -> None:

@@ -30,8 +30,8 @@ def executor_for(
     Parameters
     ----------
     jobs : processes of this machine, or jobs of Slurm at a time; -1 for as many as the backend thinks right
-    scheduler : of ``dask``, see :class:`consistency.bench.runs.backends.dask.DaskExecutor`
-    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.backends.slurm.SlurmExecutor`
+    scheduler : of ``dask``, see :class:`consistency.bench.runs.dask_executor.DaskExecutor`
+    slurm : options of ``slurm``, each ``key=value``, see :class:`consistency.bench.runs.slurm_executor.SlurmExecutor`
     wait : seconds to wait for the scheduler of ``dask``, 60 if not given
     out : folder of the results; ``slurm`` keeps the files of its jobs beside it, on a disk that they see
 
@@ -65,10 +65,10 @@ def _executor(
         return None
     try:
         if name == "dask":
-            from consistency.bench.runs.backends.dask import DaskExecutor
+            from consistency.bench.runs.dask_executor import DaskExecutor
 
             return DaskExecutor(scheduler, jobs, WAIT if wait is None else wait)
-        from consistency.bench.runs.backends.slurm import SlurmExecutor, options_of
+        from consistency.bench.runs.slurm_executor import SlurmExecutor, options_of
 
         return SlurmExecutor(out.absolute().with_name(f".{out.absolute().name}.jobs"), options_of(slurm), jobs)
     except ImportError:

@@ -1,6 +1,6 @@
-"""The decisions of ``plain_rules`` in kernels, and the part that makes them: one for all kinds of guards.
+"""The guard of compiled filters: the rules of ``filters.guard`` in kernels, and the part that applies them.
 
-A filter behind any of them has one kernel.
+It is one part for all kinds of guards, so that a filter behind any of them has one kernel.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import numpy as np
 
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.guard.plain_rules import KINDS, MOST_NODES, limits_of
+from consistency.bench.filters.guard import KINDS, MOST_NODES, limits_of
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
     State,
-    make_watch,
+    make_guard_arrays,
     may_enter,
     observed_width,
     predict_innovation,
@@ -24,12 +24,12 @@ from consistency.bench.filters.kernel.part_functions import (
     screen,
     withhold,
 )
-from consistency.bench.filters.kernel.update_steps import INNOVATION, Work
+from consistency.bench.filters.kernel.update_steps import INNOVATION, Scratch
 from consistency.bench.scenario import GuardSettings
 from consistency.referee.types import Array, Indices
 
 
-class Watch(NamedTuple):
+class GuardArrays(NamedTuple):
     """For M rows of data, up to m landmarks in a step, and s values of each."""
 
     rejected: Array  # (M,) which rows the filter is not given, or has forgotten
@@ -50,16 +50,16 @@ class Watch(NamedTuple):
 
 
 @inner
-def added_distance(i: int, count: int, s: int, y: Array, S: Array, watch: Watch) -> float:
+def added_distance(i: int, count: int, s: int, y: Array, S: Array, of_guard: GuardArrays) -> float:
     """By how much observation i adds to the squared distance of the ``count`` chosen ones; NaN if S is not definite.
 
     That is its own squared distance after an update with those. ``root`` and ``white`` get its rows behind theirs.
     """
-    root, white, added = watch.root, watch.white, 0.0
+    root, white, added = of_guard.root, of_guard.white, 0.0
     for a in range(s):
         row, p = s * count + a, s * i + a
         for g in range(count + 1):
-            first = s * (watch.chosen[g] if g < count else i)
+            first = s * (of_guard.chosen[g] if g < count else i)
             for e in range(s if g < count else a + 1):
                 c, q = s * g + e, first + e
                 rest = S[p, q] if p < q else S[q, p]
@@ -80,39 +80,39 @@ def added_distance(i: int, count: int, s: int, y: Array, S: Array, watch: Watch)
 
 
 @inner
-def pass_gate(limit: float, s: int, m: int, y: Array, S: Array, watch: Watch) -> int:
+def pass_gate(limit: float, s: int, m: int, y: Array, S: Array, of_guard: GuardArrays) -> int:
     """``own`` (m,) <- squared distances, ``kept`` (m,) <- whether each is within ``limit``; returns how many are.
 
     -1 where S is not positive definite.
     """
     count = 0
     for i in range(m):
-        watch.own[i] = added_distance(i, 0, s, y, S, watch)
-        if not watch.own[i] >= 0.0:
+        of_guard.own[i] = added_distance(i, 0, s, y, S, of_guard)
+        if not of_guard.own[i] >= 0.0:
             return -1
-        watch.kept[i] = watch.own[i] <= limit
-        if watch.kept[i]:
-            watch.order[count] = i
+        of_guard.kept[i] = of_guard.own[i] <= limit
+        if of_guard.kept[i]:
+            of_guard.order[count] = i
             count += 1
     return count
 
 
 @inner
-def keep_compatible(joint: Array, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+def keep_compatible(joint: Array, count: int, s: int, m: int, y: Array, S: Array, of_guard: GuardArrays) -> bool:
     """``kept`` (m,) <- the largest jointly compatible set of the ``count`` that passed the gate."""
-    _sort_by_distance(count, watch)
-    best = _search(joint, count, s, y, S, watch)
+    _sort_by_distance(count, of_guard)
+    best = _search(joint, count, s, y, S, of_guard)
     for i in range(m):
-        watch.kept[i] = False
+        of_guard.kept[i] = False
     for i in range(best):
-        watch.kept[watch.best[i]] = True
+        of_guard.kept[of_guard.best[i]] = True
     return best >= 0
 
 
 @inner
-def _sort_by_distance(count: int, watch: Watch) -> None:
+def _sort_by_distance(count: int, of_guard: GuardArrays) -> None:
     """``order`` (count,) <- nearest first; a stable insertion sort, for there are few."""
-    order, own = watch.order, watch.own
+    order, own = of_guard.order, of_guard.own
     for last in range(1, count):
         i, place = order[last], last
         while place > 0 and own[order[place - 1]] > own[i]:
@@ -122,12 +122,12 @@ def _sort_by_distance(count: int, watch: Watch) -> None:
 
 
 @inner
-def _search(joint: Array, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+def _search(joint: Array, count: int, s: int, y: Array, S: Array, of_guard: GuardArrays) -> int:
     """``best`` <- the largest jointly compatible set of ``order`` (count,), by branch and bound; returns its size.
 
     At each level an observation is first taken, then left out. -1 where S is not positive definite.
     """
-    size, total, branch, chosen = watch.size, watch.total, watch.branch, watch.chosen
+    size, total, branch, chosen = of_guard.size, of_guard.total, of_guard.branch, of_guard.chosen
     best, nearest, nodes, level = 0, 0.0, 0, 0
     size[0], total[0], branch[0] = 0, 0.0, 0
     while level >= 0:
@@ -136,7 +136,7 @@ def _search(joint: Array, count: int, s: int, y: Array, S: Array, watch: Watch) 
             if far <= joint[n] and (n > best or (n == best and far < nearest)):
                 best, nearest = n, far
                 for i in range(n):
-                    watch.best[i] = chosen[i]
+                    of_guard.best[i] = chosen[i]
             level -= 1
             continue
         if branch[level] == 2:
@@ -147,10 +147,10 @@ def _search(joint: Array, count: int, s: int, y: Array, S: Array, watch: Watch) 
             break
         branch[level] += 1
         if branch[level] == 1:
-            far += added_distance(watch.order[level], n, s, y, S, watch)
+            far += added_distance(of_guard.order[level], n, s, y, S, of_guard)
             if np.isnan(far):
                 return -1
-            chosen[n] = watch.order[level]
+            chosen[n] = of_guard.order[level]
             n += 1
         most = n + count - level - 1
         if (most > best or (most == best and far < nearest)) and far <= joint[most]:
@@ -160,50 +160,54 @@ def _search(joint: Array, count: int, s: int, y: Array, S: Array, watch: Watch) 
 
 
 @inner
-def keep_supported(own: float, support: float, count: int, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
+def keep_supported(
+    own: float, support: float, count: int, s: int, m: int, y: Array, S: Array, of_guard: GuardArrays
+) -> bool:
     """``kept`` (m,) <- what supports the best hypothesis and what is rescued, of the ``count`` that passed the gate.
 
     ``own`` and ``support`` are the squared distances up to which an observation passes the gate and supports.
     """
-    best = _best_hypothesis(support, count, s, y, S, watch)
+    best = _best_hypothesis(support, count, s, y, S, of_guard)
     for i in range(m):
-        watch.kept[i] = False
+        of_guard.kept[i] = False
     if best < 0:
         return True
-    low = _list_support(best, support, count, s, y, S, watch)
+    low = _list_support(best, support, count, s, y, S, of_guard)
     for i in range(low):
-        watch.chosen[i] = watch.best[i]
-        watch.kept[watch.best[i]] = True
-        if not added_distance(watch.best[i], i, s, y, S, watch) >= 0.0:
+        of_guard.chosen[i] = of_guard.best[i]
+        of_guard.kept[of_guard.best[i]] = True
+        if not added_distance(of_guard.best[i], i, s, y, S, of_guard) >= 0.0:
             return False
     for c in range(count):
-        i = watch.order[c]
-        watch.kept[i] = watch.kept[i] or added_distance(i, low, s, y, S, watch) <= own  # rescued
+        i = of_guard.order[c]
+        of_guard.kept[i] = of_guard.kept[i] or added_distance(i, low, s, y, S, of_guard) <= own  # rescued
     return True
 
 
 @inner
-def _best_hypothesis(support: float, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+def _best_hypothesis(support: float, count: int, s: int, y: Array, S: Array, of_guard: GuardArrays) -> int:
     """The observation with most support, the nearest of several; -1 if there is none."""
     best, most = -1, 0
     for c in range(count):
-        i = watch.order[c]
-        supporters = _list_support(i, support, count, s, y, S, watch)
-        if supporters > most or (supporters == most and watch.own[i] < watch.own[best]):
+        i = of_guard.order[c]
+        supporters = _list_support(i, support, count, s, y, S, of_guard)
+        if supporters > most or (supporters == most and of_guard.own[i] < of_guard.own[best]):
             best, most = i, supporters
     return best
 
 
 @inner
-def _list_support(hypothesis: int, support: float, count: int, s: int, y: Array, S: Array, watch: Watch) -> int:
+def _list_support(
+    hypothesis: int, support: float, count: int, s: int, y: Array, S: Array, of_guard: GuardArrays
+) -> int:
     """``best`` <- the hypothesis and what it leaves within ``support``, in order; returns how many."""
     found = 0
-    added_distance(hypothesis, 0, s, y, S, watch)
-    watch.chosen[0] = hypothesis
+    added_distance(hypothesis, 0, s, y, S, of_guard)
+    of_guard.chosen[0] = hypothesis
     for c in range(count):
-        i = watch.order[c]
-        if i == hypothesis or added_distance(i, 1, s, y, S, watch) <= support:
-            watch.best[found] = i
+        i = of_guard.order[c]
+        if i == hypothesis or added_distance(i, 1, s, y, S, of_guard) <= support:
+            of_guard.best[found] = i
             found += 1
     return found
 
@@ -231,9 +235,9 @@ def guard_part(kind: str, settings: GuardSettings, s: int, m: int) -> Guard:
     return Guard(list(KINDS).index(kind), settings.min_age, settings.forget_after or 0, limits.joint, limits.support)
 
 
-@implement(make_watch, Guard)
-def watch_tracks(guard: Guard, s: int, m: int, rows: int, n_landmarks: int) -> Watch:
-    return Watch(
+@implement(make_guard_arrays, Guard)
+def guard_arrays(guard: Guard, s: int, m: int, rows: int, n_landmarks: int) -> GuardArrays:
+    return GuardArrays(
         np.zeros(rows, np.bool_),
         np.zeros(n_landmarks, np.int64),
         np.zeros(n_landmarks, np.int64),
@@ -260,89 +264,93 @@ def screen_known(
     data: Data,
     k: int,
     m: int,
-    local: NamedTuple,
-    work: Work[NamedTuple],
-    watch: Watch,
+    of_covariance: NamedTuple,
+    scratch: Scratch[NamedTuple],
+    of_guard: GuardArrays,
 ) -> tuple[int, int, bool]:
     """First by the track, then by what the filter expects of the landmarks that it knows."""
-    m = _screen_tracks(guard, state.offset, data, k, m, work, watch)
-    withhold(slam.covariance, state, data, k, watch.rejected, watch.again, local)
+    m = _screen_tracks(guard, state.offset, data, k, m, scratch, of_guard)
+    withhold(slam.covariance, state, data, k, of_guard.rejected, of_guard.again, of_covariance)
     if m == 0:
         return 0, 0, False
-    code, _ = predict_innovation(slam.update, slam, state, data, k, m, local, work)
+    code, _ = predict_innovation(slam.update, slam, state, data, k, m, of_covariance, scratch)
     if code > 0:
         return code, m, False
     s = observed_width(slam.sensor)
-    if not keep_agreeing(guard, s, m, work.A[: s * m, state.n + state.base], work.S, watch):
+    if not keep_agreeing(guard, s, m, scratch.A[: s * m, state.n + state.base], scratch.S, of_guard):
         return INNOVATION, m, False
     for i in range(m):
-        row, label, kept = work.known[i], work.label[i], watch.kept[i]
-        watch.rejected[row] = not kept
-        watch.misses[label] = 0 if kept else watch.misses[label] + 1
-        watch.again[row] = not kept and watch.begun[label] >= 0
+        row, label, kept = scratch.known[i], scratch.label[i], of_guard.kept[i]
+        of_guard.rejected[row] = not kept
+        of_guard.misses[label] = 0 if kept else of_guard.misses[label] + 1
+        of_guard.again[row] = not kept and of_guard.begun[label] >= 0
         if kept:
-            watch.begun[label] = -1
-    left = _without_rejected(m, work, watch)
+            of_guard.begun[label] = -1
+    left = _without_rejected(m, scratch, of_guard)
     if left < m:
-        withhold(slam.covariance, state, data, k, watch.rejected, watch.again, local)
-        _restart(data, k, watch)
+        withhold(slam.covariance, state, data, k, of_guard.rejected, of_guard.again, of_covariance)
+        _restart(data, k, of_guard)
     return 0, left, left == m
 
 
 @inner
-def keep_agreeing(guard: Guard, s: int, m: int, y: Array, S: Array, watch: Watch) -> bool:
-    """``watch.kept`` (m,) <- which of ``m`` observations to keep, by innovation (s m,) and the upper half of S.
+def keep_agreeing(guard: Guard, s: int, m: int, y: Array, S: Array, of_guard: GuardArrays) -> bool:
+    """``of_guard.kept`` (m,) <- which of ``m`` observations to keep, by innovation (s m,) and the upper half of S.
 
     False where S is not positive definite.
     """
-    count = pass_gate(guard.joint[1], s, m, y, S, watch)
+    count = pass_gate(guard.joint[1], s, m, y, S, of_guard)
     if count >= 0 and guard.kind == JOINT:
-        return keep_compatible(guard.joint, count, s, m, y, S, watch)
+        return keep_compatible(guard.joint, count, s, m, y, S, of_guard)
     if count >= 0 and guard.kind == RANSAC:
-        return keep_supported(guard.joint[1], guard.support, count, s, m, y, S, watch)
+        return keep_supported(guard.joint[1], guard.support, count, s, m, y, S, of_guard)
     return count >= 0
 
 
 @inner
 def _screen_tracks(
-    guard: Guard, offset: Indices, data: Data, k: int, m: int, work: Work[NamedTuple], watch: Watch
+    guard: Guard, offset: Indices, data: Data, k: int, m: int, scratch: Scratch[NamedTuple], of_guard: GuardArrays
 ) -> int:
     """Rejects observations of tracks that are too young or given up; returns how many known landmarks are left."""
     for i in range(data.first[k], data.first[k + 1]):
         label = data.landmark[i]
-        watch.sightings[label] += 1
-        is_given_up = 0 < guard.forget_after <= watch.misses[label]
-        watch.rejected[i] = is_given_up or watch.sightings[label] < guard.min_age
-        if offset[label] < 0 and not watch.rejected[i]:
-            watch.begun[label] = i
-    return _without_rejected(m, work, watch)
+        of_guard.sightings[label] += 1
+        is_given_up = 0 < guard.forget_after <= of_guard.misses[label]
+        of_guard.rejected[i] = is_given_up or of_guard.sightings[label] < guard.min_age
+        if offset[label] < 0 and not of_guard.rejected[i]:
+            of_guard.begun[label] = i
+    return _without_rejected(m, scratch, of_guard)
 
 
 @inner
-def _restart(data: Data, k: int, watch: Watch) -> None:
+def _restart(data: Data, k: int, of_guard: GuardArrays) -> None:
     """What a landmark began with is rejected, where it restarts with the first that disagrees."""
     for i in range(data.first[k], data.first[k + 1]):
-        if watch.again[i]:
+        if of_guard.again[i]:
             label = data.landmark[i]
-            watch.rejected[watch.begun[label]], watch.rejected[i] = True, False
-            watch.begun[label] = i
+            of_guard.rejected[of_guard.begun[label]], of_guard.rejected[i] = True, False
+            of_guard.begun[label] = i
 
 
 @inner
-def _without_rejected(m: int, work: Work[NamedTuple], watch: Watch) -> int:
+def _without_rejected(m: int, scratch: Scratch[NamedTuple], of_guard: GuardArrays) -> int:
     left = 0
     for i in range(m):
-        if not watch.rejected[work.known[i]]:
-            work.known[left], work.label[left], work.at[left] = work.known[i], work.label[i], work.at[i]
+        if not of_guard.rejected[scratch.known[i]]:
+            scratch.known[left], scratch.label[left], scratch.at[left] = (
+                scratch.known[i],
+                scratch.label[i],
+                scratch.at[i],
+            )
             left += 1
     return left
 
 
 @implement(may_enter, Guard)
-def enters_unless_rejected(guard: Guard, row: int, is_known: bool, watch: Watch) -> bool:
-    return watch.again[row] if is_known else not watch.rejected[row]
+def enters_unless_rejected(guard: Guard, row: int, is_known: bool, of_guard: GuardArrays) -> bool:
+    return of_guard.again[row] if is_known else not of_guard.rejected[row]
 
 
 @implement(rejected_rows, Guard)
-def rejected_of(guard: Guard, watch: Watch) -> Array:
-    return watch.rejected.copy()
+def rejected_of(guard: Guard, of_guard: GuardArrays) -> Array:
+    return of_guard.rejected.copy()

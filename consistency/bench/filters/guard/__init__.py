@@ -1,1 +1,0 @@
-"""Guards: which observations a filter is given. ``plain_rules`` has the kinds, and what a guard of each decides."""

@@ -1,1 +1,0 @@
-"""Where the runs of a study are done: executors, which know nothing of runs."""

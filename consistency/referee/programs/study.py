@@ -575,7 +575,7 @@ def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:
 
 def _digits(one: Estimator) -> list[bytes]:
     p = one.runs[0]
-    arrays = (p.t, p.estimate, p.truth, p.nis)
+    arrays = (p.own.t, p.own.estimate, p.true.values, p.own.nis)
     return [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
 
 

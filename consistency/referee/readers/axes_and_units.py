@@ -113,8 +113,8 @@ def _matrix(option: str, letters: str, directions: Mapping[str, Array]) -> Array
 def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
     """A run with its truth in other axes, and the covariance of that truth."""
     A, C = change
-    truth = p.truth.copy()
-    P = p.true_covariance
+    truth = p.true.values.copy()
+    P = p.true.covariance
     if not in_space:
         truth[:, :2] = truth[:, :2] @ A[:2, :2].T
         start = A @ C.T
@@ -133,7 +133,7 @@ def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
                 truth[:, first : first + 3] = truth[:, first : first + 3] @ axes.T
     if P is not None:
         P = _carried(P, p.convention, change, in_space)
-    return replace(p, truth=truth, true_covariance=P)
+    return p.with_values(truth=truth, true_covariance=P)
 
 
 def _carried(P: Array, convention: str, change: Change, in_space: bool) -> Array:
@@ -170,7 +170,7 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
         poses = []
         beyond = False
         for p in runs:
-            values = getattr(p, name)
+            values = p.value(name)
             finite = values[finite_rows(values)]
             poses.append(finite)
             beyond |= bool((np.abs(finite[:, 2]) > 2.0 * np.pi + 0.1).any())
@@ -228,8 +228,8 @@ def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     variances = []
     for p in runs:
         known = p.matched()
-        gaps.append(known.truth[:, 2] - known.estimate[:, 2])
-        variances.append(known.covariance[:, 2, 2])
+        gaps.append(known.true.values[:, 2] - known.own.estimate[:, 2])
+        variances.append(known.own.covariance[:, 2, 2])
     gap = np.concatenate(gaps)
     variance = np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)

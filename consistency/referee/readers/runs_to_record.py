@@ -379,7 +379,7 @@ def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence
     variances = []
     of_part = []
     for p, error in zip(e.runs, errors, strict=True):
-        variances.append(p.variances[p.stated][:, part])
+        variances.append(p.variances[p.own.stated][:, part])
         of_part.append(error[:, part])
     idle = not_estimated(of_part, variances)
     if not idle.any():
@@ -398,10 +398,10 @@ def level_components(e: Estimator, judged: Sequence[int]) -> tuple[list[int], li
     part = list(judged)
     near = []
     for p in e.runs:
-        from_, to = p.t.min(initial=np.inf) - BESIDE, p.t.max(initial=-np.inf) + BESIDE
-        near.append(p.truth[(p.true_t >= from_) & (p.true_t <= to)])
-    fixed = unchanging(e.runs, [p.estimate for p in e.runs])[part]
-    variance = np.concatenate([p.variances[p.stated][:, part] for p in e.runs])
+        from_, to = p.own.t.min(initial=np.inf) - BESIDE, p.own.t.max(initial=-np.inf) + BESIDE
+        near.append(p.true.values[(p.true.t >= from_) & (p.true.t <= to)])
+    fixed = unchanging(e.runs, [p.own.estimate for p in e.runs])[part]
+    variance = np.concatenate([p.variances[p.own.stated][:, part] for p in e.runs])
     variance = variance[~np.isnan(variance).any(axis=1)]
     constant = np.isclose(variance, variance[:1], rtol=NO_ERROR, atol=0.0).all(axis=0)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
@@ -425,7 +425,7 @@ def unchanging(runs: Sequence[Poses], states: Sequence[Array]) -> Indices:
     ----------
     states : (k, m) of each run, estimates or truth
     """
-    n = runs[0].covariance.shape[-1]
+    n = runs[0].own.covariance.shape[-1]
     found = np.zeros((0, n), bool)
     for p, values in zip(runs, states, strict=True):
         values = values[finite_rows(values)]

@@ -375,19 +375,19 @@ def _facts(found: Estimator | Record) -> Iterator[tuple[str, str]]:
         yield "rows", f"{plural(len(found.run_numbers), 'run')} of {plural(len(found.runs.t), 'step')}"
         return
     runs, first = found.runs, found.runs[0]
-    rows = [len(p.t) for p in runs]
+    rows = [len(p.own.t) for p in runs]
     size = plural(rows[0], "row") if min(rows) == max(rows) else f"{min(rows)} to {max(rows)} rows"
     yield "rows", f"{found.name}: {plural(len(runs), 'run')} of {size}{_span(first.seconds)}"
-    clock = f"{'steps' if first.numbered else 'times'}, {first.t[0]:.10g} to {first.t[-1]:.10g}"
-    if not first.numbered and EPOCH < first.t[0] < 4 * EPOCH:
-        clock += f", from {datetime.fromtimestamp(first.t[0], timezone.utc):%Y-%m-%d %H:%M} UTC"
+    clock = f"{'steps' if first.source.numbered else 'times'}, {first.own.t[0]:.10g} to {first.own.t[-1]:.10g}"
+    if not first.source.numbered and EPOCH < first.own.t[0] < 4 * EPOCH:
+        clock += f", from {datetime.fromtimestamp(first.own.t[0], timezone.utc):%Y-%m-%d %H:%M} UTC"
     yield "clock", clock
     if found.innovations_alone:
         return
     yield "covariance", "; ".join(_covariance(found))
     share = sum(len(p.known().rows) for p in runs) / max(sum(rows), 1)
-    of_truth = "" if first.numbered else _span(first.true_t)
-    yield "truth", f"{plural(len(first.true_t), 'row')}{of_truth}; at {percent(share, 3)} of the estimates"
+    of_truth = "" if first.source.numbered else _span(first.true.t)
+    yield "truth", f"{plural(len(first.true.t), 'row')}{of_truth}; at {percent(share, 3)} of the estimates"
 
 
 def _span(t: Array) -> str:
@@ -399,7 +399,7 @@ def _span(t: Array) -> str:
 
 def _stated(e: Estimator) -> Array:
     """All covariances that are stated, (N, n, n)."""
-    return np.concatenate([p.covariance[p.stated] for p in e.runs])
+    return np.concatenate([p.own.covariance[p.own.stated] for p in e.runs])
 
 
 def _covariance(e: Estimator) -> Iterator[str]:
@@ -441,7 +441,7 @@ def _suspects(e: Estimator) -> Iterator[str]:
                 yield f"the stated deviation of {of[max(of)]} is {times}; one of them may be a placeholder"
     if e.in_space and e.runs[0].manifold == "spatial":
         for name, values in (("estimates", "estimate"), ("truth", "truth")):
-            q = np.concatenate([getattr(p, values)[:, 3:7] for p in e.runs])
+            q = np.concatenate([p.value(values)[:, 3:7] for p in e.runs])
             if len(q) > 1 and (q == q[0]).all():
                 yield f"the orientation of the {name} is the same in every row; if it is a placeholder, --axes x,y,z"
 

@@ -48,7 +48,7 @@ def of_members(e: Estimator, r: Reading) -> Estimator:
         "ensemble": ", which is for their mean and covariance alone", "relative": "", "align": "", "axes": "",
         "truth_covariance": ": ranks have no covariance that it could be added to",
     })  # fmt: skip
-    first = e.runs[0].members
+    first = e.runs[0].own.members
     assert first is not None
     m, n = first.shape[1:]
     if m < 2:
@@ -65,8 +65,8 @@ def of_members(e: Estimator, r: Reading) -> Estimator:
         notes.append(f"{e.said}: {m} members of {n} components say nothing of all components together; m > n would")
     runs = []
     for p in e.runs:
-        covariance = np.broadcast_to(np.eye(len(axes)), (len(p.t), len(axes), len(axes)))
-        runs.append(replace(p, covariance=covariance, stated=np.ones(len(p.t), bool)))
+        covariance = np.broadcast_to(np.eye(len(axes)), (len(p.own.t), len(axes), len(axes)))
+        runs.append(p.with_values(covariance=covariance, stated=np.ones(len(p.own.t), bool)))
     return replace(e, runs=runs, axes=axes, stated=ALONE, notes=(*e.notes, *notes))
 
 

@@ -55,6 +55,7 @@ from consistency.referee.readers.truth_matching import (
     Poses,
     Stated,
     finite_rows,
+    make_poses,
     unstated,
 )
 from consistency.referee.system.progress import counted
@@ -130,7 +131,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
             raise InputError(mixed or what)
         one, unjudged = _beside_truth(replace(run, own=own, true=true), layout, r)
         notes.append(unjudged)
-        poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end()))
+        poses.append(one.with_values(run=len(poses), files=run.files, open_end=own.open_end()))
     assert layout is not None
     if poses[0].manifold == "spatial" and r.components.axes is None and r.runs.relative is None:
         is_empty, what = placeholder(poses)
@@ -151,7 +152,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     elif not why:
         why = f"; the default of this layout, {_origin(layout.stated)}"
     definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
-    axes = STATE[: poses[0].covariance.shape[-1]]
+    axes = STATE[: poses[0].own.covariance.shape[-1]]
     return Estimator(
         path.stem,
         path,
@@ -236,7 +237,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     true = run.true
     by = _own_column(own, r.groups)
     if isinstance(own, Fixes):
-        return replace(fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), by=by), ""
+        return fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)).with_values(by=by), ""
     k, note = judged_rest(own, true, r)
     order = r.conventions.covariance_order or ORDERS[0]
     P, known = unstated(len(own.t), 6 + k)
@@ -246,7 +247,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     of_truth = _of_truth(true, own, order, r)
     run = replace(run, own=own.of(slice(0, POSE_NUMBERS)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
-    poses = replace(poses, cross=cross, true_covariance=of_truth, by=by)
+    poses = poses.with_values(cross=cross, true_covariance=of_truth, by=by)
     if _is_point(true):
         poses = point_positions(poses, r.matching.lever_arm, layout.stated != WHOLE)
     return poses, note
@@ -267,7 +268,7 @@ def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: 
     """Poses beside the true ones, both with the first ``k`` numbers of velocity and biases behind them."""
     own = run.own
     true = run.true
-    return Poses(
+    return make_poses(
         place=own.places,
         t=own.t,
         estimate=_states(own, k),

@@ -384,8 +384,8 @@ def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence
     idle = not_estimated(of_part, variances)
     if not idle.any():
         return list(judged), []
-    names = ", ".join(np.array(e.axes)[part[idle]])
-    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
+    names = ", ".join(np.array(e.error.axes)[part[idle]])
+    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.error.axes)} judges them, too"
     return part[~idle].tolist(), [note]
 
 
@@ -409,7 +409,7 @@ def level_components(e: Estimator, judged: Sequence[int]) -> tuple[list[int], li
     if not fixed.any() or idle.all() or (none & ~idle).any():  # a variance may be in the wrong row
         return part, []
     notes = []
-    names = np.array(e.axes)[part]
+    names = np.array(e.error.axes)[part]
     for which, what, left in ((idle, f"are {LEVEL}", ~idle), (fixed & ~idle, FIXED, ~fixed)):
         if which.any():
             notes.append(f"{e.said}: {', '.join(names[which])} {what.format(','.join(names[left]), ','.join(names))}")

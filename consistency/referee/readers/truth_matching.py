@@ -464,27 +464,34 @@ class Bounds(NamedTuple):
 
 
 @dataclass(frozen=True)
+class StatedError:
+    """Components of an estimator's error, and what of its covariance is stated."""
+
+    axes: Sequence[str]  # names of the components
+    convention: str = ""  # "" where the file holds errors
+    definition: str = ""  # of the convention, in words
+    stated: Stated = WHOLE
+    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
+    in_space: bool = False  # poses in space, or positions beside such a truth
+    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
+    assumed: bool = False  # its covariance is I, as the files state none
+    bounds: Bounds | None = None  # that are stated in place of covariances
+
+
+@dataclass(frozen=True)
 class Estimator:
     """The runs of one estimator, with what its record is called and what a reader must know of it."""
 
     name: str
     path: Path  # of the estimates, for messages
     runs: Sequence[Poses]
-    axes: Sequence[str]  # names of the components of the error
-    convention: str = ""  # of the error; "" where the file holds errors
-    definition: str = ""  # of the convention, in words
-    stated: Stated = WHOLE
+    error: StatedError
     label: str = ""  # of the estimator in notes; its name if there is none
     covariances: Path | None = None  # file of the covariances; that of the estimates if there is none
     notes: Sequence[str] = ()  # what the files were read as
     causes: Sequence[str] = ()  # mix-ups that are found while reading
-    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
-    in_space: bool = False  # poses in space, or positions beside such a truth
-    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
     t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
     innovations_alone: bool = False  # there is no truth
-    assumed: bool = False  # its covariance is I, as the files state none
-    bounds: Bounds | None = None  # that are stated in place of covariances
     failed: Mapping[int, str] = field(default_factory=dict)  # runs without estimates, and why they have none
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
@@ -492,3 +499,11 @@ class Estimator:
     def said(self) -> str:
         """Its name in notes."""
         return self.label or self.name
+
+    def with_notes(self, *notes: str) -> Estimator:
+        """The estimator with more notes behind its own."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def with_error(self, **changes: Any) -> Estimator:
+        """The estimator with other values of its error."""
+        return replace(self, error=replace(self.error, **changes))

@@ -409,8 +409,8 @@ def _covariance(e: Estimator) -> Iterator[str]:
         yield "none is stated"
         return
     usual = np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
-    parts = "matrix" if e.stated == WHOLE else "deviations alone" if e.stated.alone else "blocks"
-    yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.axes, usual, strict=True))}"
+    parts = "matrix" if e.error.stated == WHOLE else "deviations alone" if e.error.stated.alone else "blocks"
+    yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.error.axes, usual, strict=True))}"
     same = (variances == variances[0]).all(axis=0)
     value = variances[0]
     for words, some in (
@@ -420,7 +420,7 @@ def _covariance(e: Estimator) -> Iterator[str]:
         ("constant", same & (value > 0) & (value < LARGE)),
     ):
         if some.any() and len(variances) > 1:
-            yield f"{words}: {', '.join(np.array(e.axes)[some])}"
+            yield f"{words}: {', '.join(np.array(e.error.axes)[some])}"
 
 
 def _suspects(e: Estimator) -> Iterator[str]:
@@ -429,17 +429,18 @@ def _suspects(e: Estimator) -> Iterator[str]:
     if len(P) > 1:
         some = np.flatnonzero(P.any(axis=(0, 1))).tolist()  # components with a variance
         bad = int((classify(submatrices(P, some), ROUNDED) != Validity.VALID).sum())
-        if bad and e.stated == WHOLE:
+        if bad and e.error.stated == WHOLE:
             yield f"the covariance of {bad} of {len(P)} rows is not positive definite"
         if (P[0] == P).all():
             yield "the covariance is the same in every row: a number that was set once, rather than a filter's"
-        usual = dict(zip(e.axes, np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0))), strict=True))
+        sigma = np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0)))
+        usual = dict(zip(e.error.axes, sigma, strict=True))
         for unit in (("x", "y", "z"), ("roll", "pitch", "yaw"), ("vx", "vy", "vz")):
             of = {usual[axis]: axis for axis in unit if axis in usual and 0 < usual[axis] ** 2 < LARGE}
             if of and max(of) > UNLIKE * min(of):
                 times = f"{short(max(of) / min(of))} times that of {of[min(of)]}"
                 yield f"the stated deviation of {of[max(of)]} is {times}; one of them may be a placeholder"
-    if e.in_space and e.runs[0].manifold == "spatial":
+    if e.error.in_space and e.runs[0].manifold == "spatial":
         for name, values in (("estimates", "estimate"), ("truth", "truth")):
             q = np.concatenate([p.value(values)[:, 3:7] for p in e.runs])
             if len(q) > 1 and (q == q[0]).all():

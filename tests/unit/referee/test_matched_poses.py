@@ -20,6 +20,7 @@ from consistency.referee.readers.truth_matching import (
     Interpolation,
     Poses,
     RunSource,
+    StatedError,
     TrueStates,
     make_poses,
     submatrices,
@@ -47,7 +48,7 @@ def run_of(rng, rows=40, run=0, error=SIGMA):
 
 
 def estimator_of(*runs):
-    return Estimator("est", "est.csv", runs, ("x", "y", "heading"), "so2", "in words")
+    return Estimator("est", "est.csv", runs, StatedError(("x", "y", "heading"), "so2", "in words"))
 
 
 def test_matched_estimates_stand_beside_their_truth(rng):
@@ -124,7 +125,7 @@ def test_each_value_of_poses_has_a_name_and_few_have_many():
     assert {place for place in PLACES.values() if place[0]} == {
         (part, each.name) for part, kind in parts.items() for each in fields(kind)
     }
-    assert max(len(fields(kind)) for kind in (Poses, *parts.values())) <= 12
+    assert max(len(fields(kind)) for kind in (Poses, Estimator, StatedError, *parts.values())) <= 12
     for name, (part, field) in PLACES.items():
         changed = poses.with_values(**{name: "other"})
         assert changed.value(name) == "other"
@@ -178,5 +179,5 @@ def test_columns_of_a_state_pass_over_the_four_numbers_of_a_rotation(rng):
     """Components 3 to 5 are the rotation, whose columns 3 to 6 are a quaternion."""
     planar = estimator_of(run_of(rng))
     assert_array_equal(_columns_of(planar, [0, 2]), [0, 2])
-    assert_array_equal(_columns_of(replace(planar, in_space=True), [0, 2, 3, 5, 6, 8]), [0, 2, 7, 9])
-    assert len(_columns_of(replace(planar, convention=""), [0, 2])) == 0
+    assert_array_equal(_columns_of(planar.with_error(in_space=True), [0, 2, 3, 5, 6, 8]), [0, 2, 7, 9])
+    assert len(_columns_of(planar.with_error(convention=""), [0, 2])) == 0

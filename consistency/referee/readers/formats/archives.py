@@ -35,6 +35,7 @@ from consistency.referee.readers.truth_matching import (
     Bounds,
     Estimator,
     Poses,
+    StatedError,
     at,
     make_poses,
     manifold_of,
@@ -100,7 +101,7 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     errors, definition = extended_errors(path, arrays, r.conventions.error)
     one = estimator_of_arrays(path, errors, r.with_error(None))
     assert isinstance(one, Estimator)
-    return [replace(one, convention=r.conventions.error or "", definition=definition)]
+    return [one.with_error(convention=r.conventions.error or "", definition=definition)]
 
 
 def first_known(repeats: Array) -> Array:
@@ -186,10 +187,8 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         causes += turns(path.stem, axes, gap, covariances, remedy)
     if r.runs.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
-    definition = PLANAR.get(declared, "")
-    return Estimator(
-        path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps), bounds=bounds
-    )
+    error = StatedError(axes, declared, PLANAR.get(declared, ""), bounds=bounds)
+    return Estimator(path.stem, path, poses, error, causes=causes, t=archive.times(steps))
 
 
 def _with_bounds(archive: Archive, r: Reading) -> tuple[Archive, Bounds | None, Array | None]:
@@ -264,7 +263,7 @@ def _of_members(archive: Archive, r: Reading) -> Estimator:
     for one in _runs(archive, means, _finite_truth(path, means, truth, there), there):
         rows = one.source.run, slice(len(one.own.t))
         poses.append(one.with_values(manifold="vector", convention="vector", by=at(by, rows), members=members[rows]))
-    return of_members(Estimator(path.stem, path, poses, archive.axes(n), t=archive.times(steps)), r)
+    return of_members(Estimator(path.stem, path, poses, StatedError(archive.axes(n)), t=archive.times(steps)), r)
 
 
 def _convention(archive: Archive, r: Reading, n: int) -> str:
@@ -306,7 +305,7 @@ def _poses_of_arrays(archive: Archive) -> Estimator:
         raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
     there = archive.known(runs, steps) & np.isfinite(truth).all(axis=-1)
     poses = list(_runs(archive, estimates, truth, there))
-    return Estimator(path.stem, path, poses, PLANAR_POSE, t=archive.times(steps))
+    return Estimator(path.stem, path, poses, StatedError(PLANAR_POSE), t=archive.times(steps))
 
 
 def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Iterator[Poses]:

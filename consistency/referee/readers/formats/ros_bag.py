@@ -75,7 +75,7 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     judged, note = _stated(path, found.runs)
     if r.components.axes is not None or not note:
         return [found]
-    return [replace(found, judged=judged, notes=(*found.notes, note))]
+    return [found.with_error(judged=judged).with_notes(note)]
 
 
 def _require_whole(path: Path, bags: Sequence[Path]) -> None:

@@ -26,6 +26,7 @@ from consistency.referee.readers.truth_matching import (
     Estimator,
     Poses,
     Stated,
+    StatedError,
     finite_rows,
     make_poses,
     manifold_of,
@@ -263,7 +264,7 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
         nis=nis,
         nis_dof=dof,
     )
-    return Estimator(name, sheet.path, _by_run(sheet, runs, poses), axes, innovations_alone=True)
+    return Estimator(name, sheet.path, _by_run(sheet, runs, poses), StatedError(axes), innovations_alone=True)
 
 
 def _estimator(
@@ -336,12 +337,11 @@ def _estimator(
         if not len(one.true.t):
             has = f"holds no run {one.source.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
-    definition = PLANAR[convention]
     judged = None if bounds is None else sorted(set(sum(bounds.places, ())))
-    found = Estimator(
-        name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,
-        position=_position(axes), bounds=bounds,
-    )  # fmt: skip
+    error = StatedError(
+        axes, convention, PLANAR[convention], stated, judged=judged, position=_position(axes), bounds=bounds
+    )
+    found = Estimator(name, sheet.path, of_runs, error, notes=notes)
     if r.components.members is None:
         return found
     from consistency.referee.readers.formats.members import of_members

@@ -54,6 +54,7 @@ from consistency.referee.readers.truth_matching import (
     Files,
     Poses,
     Stated,
+    StatedError,
     finite_rows,
     make_poses,
     unstated,
@@ -153,20 +154,9 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
         why = f"; the default of this layout, {_origin(layout.stated)}"
     definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
     axes = STATE[: poses[0].own.covariance.shape[-1]]
-    return Estimator(
-        path.stem,
-        path,
-        poses,
-        axes,
-        kind,
-        definition,
-        layout.stated,
-        label=path.name,
-        covariances=r.sources.covariance,
-        notes=one_of_each_kind(notes),
-        in_space=True,
-        position=3,
-    )
+    error = StatedError(axes, kind, definition, layout.stated, in_space=True, position=3)
+    kept = one_of_each_kind(notes)
+    return Estimator(path.stem, path, poses, error, label=path.name, covariances=r.sources.covariance, notes=kept)
 
 
 def _layout_of(own: Lines, files: Files, r: Reading) -> Layout:
@@ -225,7 +215,7 @@ def poses_without_covariances(path: Path, runs: Iterable[SpaceRun], r: Reading) 
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
         covariance, stated = unstated(len(run.own.t), 6)
         poses.append(_poses(run, 0, covariance, stated, "left", r))
-    return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
+    return Estimator(path.stem, path, poses, StatedError(STATE[:6], in_space=True))
 
 
 # --- a run with its truth ----------------------------------------------------------------------------

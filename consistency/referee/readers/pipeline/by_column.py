@@ -51,7 +51,7 @@ def with_values(e: Estimator, options: GroupOptions, judged: Sequence[int]) -> t
     if len(cells) < len(e.runs):
         raise InputError(f"--by {options.by}: {e.path} {NO_COLUMNS}")
     column = column_of(options.by, np.concatenate(cells))
-    column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
+    column = replace(column, outcome=selects_on_outcome(column, [e.error.axes[i] for i in judged]))
     runs = []
     start = 0
     for p in e.runs:
@@ -77,7 +77,7 @@ def in_groups(
     """
     if pairs:
         axes = itertools.chain.from_iterable(record.errors.axes for record in records)
-        column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
+        column = _beside_states(column, e, sorted(map(list(e.error.axes).index, axes)), pairs)
     return [grouped(record, column, options) for record in records]
 
 
@@ -97,15 +97,15 @@ def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: S
         P.append(submatrices(some.own.covariance, judged))
     column = replace(column, values=np.concatenate(values))
     stacked = map(np.concatenate, (truth, estimate, P))
-    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], *stacked))
+    return replace(column, outcome=selects_on_outcome(column, [e.error.axes[i] for i in judged], *stacked))
 
 
 def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
     """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
     columns = np.array(judged, np.int64)
-    if not e.convention:  # errors of an archive stand in the place of a truth
+    if not e.error.convention:  # errors of an archive stand in the place of a truth
         return columns[:0]
-    if e.in_space:
+    if e.error.in_space:
         columns = np.concatenate([columns[columns < 3], columns[columns > 5] + 1])
     return columns
 

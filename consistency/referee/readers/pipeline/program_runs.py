@@ -31,7 +31,14 @@ from consistency.referee.readers.formats.table_columns import has_nis
 from consistency.referee.readers.options import Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import CutNote, Places, listed
-from consistency.referee.readers.truth_matching import PLACES, Estimator, Poses, Stated, make_poses
+from consistency.referee.readers.truth_matching import (
+    PLACES,
+    Estimator,
+    Poses,
+    Stated,
+    StatedError,
+    make_poses,
+)
 from consistency.referee.system.folders import read_manifest
 
 RUN_KIND = "run of a program"  # of run.json: a program may write a file of that name itself
@@ -48,6 +55,7 @@ OF_POSES = [name for name, (part, _) in PLACES.items() if part in ("own", "true"
 TEXTS_OF_POSES = ("manifold", "convention", "max_dt", "run", "name", "numbered", "open_end")
 TEXTS = ("name", "axes", "convention", "definition", "label", "notes", "causes", "judged", "in_space", "position",
          "innovations_alone")  # fmt: skip
+OF_ERROR = ("axes", "convention", "definition", "judged", "in_space", "position")  # of these texts
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
@@ -308,7 +316,7 @@ class ProgramRuns:
         if r.sources.truth is None or self.options.sources.truth is not None:
             return found
         note = f"{r.sources.truth}: taken as the truth of the run, as no column of {estimates.name} is one; see --truth"
-        return [replace(one, notes=(*one.notes, note)) for one in found]
+        return [one.with_notes(note) for one in found]
 
     @property
     def first(self) -> int:
@@ -486,7 +494,7 @@ def _one_estimator(
     first = next(iter(own.values()))
     poses: list[Poses] = []
     for run, one in own.items():
-        if (one.axes, one.stated, one.convention) != (first.axes, first.stated, first.convention):
+        if _kind_of(one.error) != _kind_of(first.error):
             raise InputError(f"{one.path}: has another state or kind of covariance than {first.path}")
         poses.append(one.runs[0].with_values(run=run))
     without = dict.fromkeys(set(all_runs).difference(own), f"it holds no estimates of '{name}'")
@@ -508,6 +516,11 @@ def _one_estimator(
         notes=list(reversed(notes.values())),
         causes=list(reversed(causes.values())),
     )
+
+
+def _kind_of(error: StatedError) -> tuple[Sequence[str], Stated, str]:
+    """What the errors of all runs of an estimator have in common."""
+    return error.axes, error.stated, error.convention
 
 
 def _without_paths(note: str, one: Estimator) -> str:
@@ -532,12 +545,12 @@ def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:
         texts: dict[str, Any] = {
             "path": str(one.path),
             "files": list(map(str, p.source.files)),
-            "alone": one.stated.alone,
-            "groups": {name: [group.start, group.stop] for name, group in one.stated.groups.items()},
+            "alone": one.error.stated.alone,
+            "groups": {name: [group.start, group.stop] for name, group in one.error.stated.groups.items()},
             "beside": p.true.t is p.own.t,
         }
         for key in TEXTS:
-            texts[key] = getattr(one, key)
+            texts[key] = getattr(one.error if key in OF_ERROR else one, key)
         for key in TEXTS_OF_POSES:
             texts[f"poses {key}"] = p.value(key)
         about.append(texts)
@@ -574,7 +587,8 @@ def _estimator(i: int, texts: dict[str, Any], arrays: dict[str, Any]) -> Estimat
     place = Places(lambda row: f"{path}, row {row + 1}", np.arange(len(own["t"])))
     poses = make_poses(place=place, files=(estimates, truth), **own)
     groups = {name: slice(*ends) for name, ends in texts["groups"].items()}
-    of_estimator = {key: texts[key] for key in TEXTS}
-    of_estimator["axes"] = tuple(texts["axes"])
-    stated = Stated(groups, texts["alone"])
-    return Estimator(path=path, runs=[poses], stated=stated, t=arrays.get(f"{i} times"), **of_estimator)
+    of_estimator = {key: texts[key] for key in TEXTS if key not in OF_ERROR}
+    of_error = {key: texts[key] for key in OF_ERROR}
+    of_error["axes"] = tuple(texts["axes"])
+    error = StatedError(stated=Stated(groups, texts["alone"]), **of_error)
+    return Estimator(path=path, runs=[poses], error=error, t=arrays.get(f"{i} times"), **of_estimator)

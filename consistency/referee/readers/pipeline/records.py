@@ -78,7 +78,7 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
 
 def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record]:
     """The records with bounds in place of covariances, where bounds are stated."""
-    if e.bounds is None:
+    if e.error.bounds is None:
         return records
     from consistency.referee.readers.formats.bounds import judged_bounds
 
@@ -99,7 +99,7 @@ def with_unit_covariances(e: Estimator) -> Estimator:
         unit = np.broadcast_to(np.eye(p.own.covariance.shape[-1]), p.own.covariance.shape)
         runs.append(p.with_values(covariance=unit, stated=np.ones(len(p.own.t), bool)))
     note = f"{e.said}: states no covariance; it is taken as I, which a factor for each component corrects"
-    return replace(e, runs=runs, stated=WHOLE, notes=(*e.notes, note), assumed=True)
+    return replace(e, runs=runs).with_error(stated=WHOLE, assumed=True).with_notes(note)
 
 
 def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
@@ -123,15 +123,15 @@ def windows_asked(r: Reading) -> Relative | None:
 def _judged(e: Estimator, r: Reading) -> list[int]:
     """Components of the error that are judged: those of ``--axes``, or all that are stated."""
     if r.components.axes is not None:
-        if unknown := set(r.components.axes).difference(e.axes):
+        if unknown := set(r.components.axes).difference(e.error.axes):
             first = next(axis for axis in r.components.axes if axis in unknown)
-            raise InputError(f"--axes {','.join(r.components.axes)}: '{first}' is not one of {', '.join(e.axes)}")
-        judged = [i for i, axis in enumerate(e.axes) if axis in r.components.axes]
-    elif e.judged is not None:
-        judged = list(e.judged)
+            raise InputError(f"--axes {','.join(r.components.axes)}: '{first}' is not one of {', '.join(e.error.axes)}")
+        judged = [i for i, axis in enumerate(e.error.axes) if axis in r.components.axes]
+    elif e.error.judged is not None:
+        judged = list(e.error.judged)
     else:
-        judged = list(range(len(e.axes)))
-    if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
+        judged = list(range(len(e.error.axes)))
+    if e.error.in_space and e.error.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
         stated = np.any([p.variances.any(axis=0) for p in e.runs], axis=0)
         judged = [i for i in judged if i < len(AXES) or stated[i]]
     return judged
@@ -142,7 +142,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     runs = e.runs
     shift = 0.0
     level: list[str] = []
-    if e.in_space and r.components.axes is None:
+    if e.error.in_space and r.components.axes is None:
         judged, level = level_components(e, judged)
     of_clocks: list[str] = []
     fit = TruthFit()
@@ -166,39 +166,39 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
             pairs[i] = p.pairs(np.arange(len(p.own.t) - 1))
             notes.insert(0, p.source.open_end)
     errors = [p.errors() for p in pairs]
-    if e.in_space:
+    if e.error.in_space:
         notes += _space_notes(e, pairs, errors)
         if r.components.axes is None:
             judged, still = estimated_components(e, errors, judged)
             notes += [*level, *still]
     causes = [*e.causes]
-    are_covariances = e.bounds is None or e.bounds.gaussian
+    are_covariances = e.error.bounds is None or e.error.bounds.gaussian
     if are_covariances and r.statement.ensemble is None and runs[0].own.members is None and not r.sources.repeats:
         causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
-    if e.convention:
-        notes.append(f"error convention {e.convention}: {e.definition}")
+    if e.error.convention:
+        notes.append(f"error convention {e.error.convention}: {e.error.definition}")
     tracks = [_track(e, p, error) for p, error in zip(pairs, errors, strict=True)]
     tracks, t, numbering = _in_columns(e, pairs, tracks)
     notes += numbering
     files = {p.source.run: str(p.source.files[0]) for p in runs}
     records = []
-    for ending, group in e.stated.groups.items():
-        part = [i for i in range(len(e.axes))[group] if i in judged]
+    for ending, group in e.error.stated.groups.items():
+        part = [i for i in range(len(e.error.axes))[group] if i in judged]
         if not part:
             continue
         some = [track.part(part) for track in tracks]
-        axes = tuple(e.axes[i] for i in part)
+        axes = tuple(e.error.axes[i] for i in part)
         file, rows = str(e.covariances or e.path), bool(r.runs.independent)
-        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
+        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.error.convention, notes, independent=rows)
         record = replace(
             record,
-            errors=replace(record.errors, assumed=e.assumed),
+            errors=replace(record.errors, assumed=e.error.assumed),
             runs=replace(record.runs, independent=rows),
             fit=fit,
             origin=replace(record.origin, files=files, causes=tuple(causes)),
         )
-        if e.stated.alone:
+        if e.error.stated.alone:
             record = each_alone(record)
         if runs[0].own.members is not None:
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ranks
@@ -215,12 +215,12 @@ def _without_cross_terms(e: Estimator, judged: Sequence[int], N: int) -> Estimat
     """The estimator with variances alone where the covariance of N members has no full rank."""
     if N < 2:
         raise InputError(f"--ensemble {N}: must be the number of members, 2 or more")
-    if len(judged) < N or e.stated.alone:
+    if len(judged) < N or e.error.stated.alone:
         return e
     unit = np.eye(e.runs[0].own.covariance.shape[-1])
     runs = [p.with_values(covariance=np.where(unit, p.own.covariance, 0.0)) for p in e.runs]
     note = f"{e.said}: the covariance of {N} members has rank {N - 1}, so each component is judged by itself"
-    return replace(e, runs=runs, stated=ALONE, notes=(*e.notes, note))
+    return replace(e, runs=runs).with_error(stated=ALONE).with_notes(note)
 
 
 # --- estimates and truth ---------------------------------------------------------------------------
@@ -302,7 +302,7 @@ def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> li
         if not runs[0].source.numbered:
             what += f" within {runs[0].max_dt:g} s (--max-dt)"
         notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
-    if furthest > ROUNDING and not e.in_space:
+    if furthest > ROUNDING and not e.error.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return notes
 
@@ -348,25 +348,25 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
-    if not e.in_space:
-        return _hints(e, runs, shift, range(len(e.axes)))
+    if not e.error.in_space:
+        return _hints(e, runs, shift, range(len(e.error.axes)))
     whole = []
-    if len(e.axes) > len(AXES):
+    if len(e.error.axes) > len(AXES):
         whole = _hints(e, runs, shift, judged)
     of_pose = [i for i in judged if i < len(AXES)]
     if whole or not of_pose:
         return whole
-    poses = replace(e, axes=e.axes[: len(AXES)])
+    poses = e.with_error(axes=e.error.axes[: len(AXES)])
     return _hints(poses, [p.alone() for p in runs], shift, of_pose)
 
 
 def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Hints on mix-ups, which are loaded where the errors do not fit."""
-    if e.assumed or is_plausible(runs, shift, judged):
+    if e.error.assumed or is_plausible(runs, shift, judged):
         return []
     from consistency.referee.readers.mix_ups.hints import hints
 
-    return hints(e.said, e.axes, runs, shift, judged)
+    return hints(e.said, e.error.axes, runs, shift, judged)
 
 
 # --- records -----------------------------------------------------------------------------------------
@@ -375,11 +375,11 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
     path = t = ratios = None
-    if e.bounds is not None and p.own.bounds is not None:
+    if e.error.bounds is not None and p.own.bounds is not None:
         from consistency.referee.readers.formats.bounds import ratios_of
 
-        ratios = ratios_of(e.bounds, p.own.bounds, error)
-    width = e.position
+        ratios = ratios_of(e.error.bounds, p.own.bounds, error)
+    width = e.error.position
     if width:
         true = p.true.values[:, :width]
         path = np.stack([true, p.own.estimate[:, :width]], axis=1)
@@ -441,7 +441,7 @@ def _innovations(e: Estimator, independent: bool) -> Record:
         tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes, independent=independent)
+    record = assemble(e.name, tracks, t, tuple(e.error.axes), str(e.path), "", notes, independent=independent)
     errors = replace(record.errors, error=None, dof=0)
     return replace(record, errors=errors, runs=replace(record.runs, independent=independent))
 
@@ -450,7 +450,7 @@ def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative
     """The record of motions over windows."""
     from consistency.referee.readers.pipeline.relative_motions import causes_of_motions, relative_recording
 
-    if e.stated != WHOLE:
+    if e.error.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
     runs = []
     for p in e.runs:

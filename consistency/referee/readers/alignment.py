@@ -167,7 +167,7 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         if len(sound.rows):
             some.append(i)
             residuals.append(sound.whitened)
-            tangents.append(tangent(p, sound, free, judged))
+            tangents.append(tangent(p, sound, free))
     of = "each run"
     if for_all:
         bases = orthonormal(tangents)
@@ -317,9 +317,9 @@ def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
     alike = np.tile(np.eye(n), (len(p.own.t), 1, 1))
     plain = p.with_values(covariance=alike)
     _, truth = _first(name, p)
-    first = Sound(np.array([row]), truth[None], np.zeros((1, n)))
-    of_first = tangent(plain, first, free, range(n))[0]
-    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(of_first)
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
+    of_first = tangent(plain, first, free)[0]
+    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
     return np.asarray(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2))
 
 
@@ -329,7 +329,8 @@ class Sound:
 
     rows: Indices  # (k,)
     truth: Array  # (k, m)
-    whitened: Array  # (k, n), errors, of the components that are judged
+    whitened: Array  # (k, n), errors of the components that are judged
+    judged: Sequence[int]  # (n,)
 
 
 def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sound:
@@ -338,7 +339,7 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
         known = p.known()
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
     fine = finite_rows(w) & p.own.stated[known.rows]
-    return Sound(known.rows[fine], known.truth[fine], w[fine])
+    return Sound(known.rows[fine], known.truth[fine], w[fine], judged)
 
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
@@ -350,7 +351,7 @@ def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> A
     return by_runs(of_block, error, rows)
 
 
-def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
+def tangent(p: Poses, sound: Sound, free: Array) -> Array:
     """Change of the whitened errors with a small motion of the world of the estimates, (k, n, d).
 
     The truth is moved the other way instead: errors and covariances are carried alike, so that the whitened errors
@@ -362,12 +363,12 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     """
 
     def of_block(truth: Array, rows: Indices) -> Array:
-        out = np.empty((len(rows), len(judged), len(free)))
+        out = np.empty((len(rows), len(sound.judged), len(free)))
         for k, motion in enumerate(DIFFERENCE * free):
             after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
             before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
             change = (after - before) / (2.0 * DIFFERENCE)
-            out[:, :, k] = _whitened(p, rows, change, judged)
+            out[:, :, k] = _whitened(p, rows, change, sound.judged)
         return out
 
     return by_runs(of_block, sound.truth, sound.rows)
@@ -402,7 +403,7 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     if not any(len(sound.rows) for _, sound in found):
         raise InputError(f"--align: no estimate of {name} has a truth and a covariance of full rank to be aligned by")
     for _ in range(FRAME_ROUNDS):
-        step, size = _step(found, free, judged)
+        step, size = _step(found, free)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
             step = 0.5 * step
@@ -415,12 +416,12 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     return frame
 
 
-def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
+def _step(found: Sequence[tuple[Poses, Sound]], free: Array) -> tuple[Array, float]:
     """Gauss-Newton step (d,), and its length in stated standard deviations."""
     tangents = []
     whitened = []
     for p, sound in found:
-        tangents.append(tangent(p, sound, free, judged).reshape(-1, len(free)))
+        tangents.append(tangent(p, sound, free).reshape(-1, len(free)))
         whitened.append(sound.whitened.ravel())
     A = np.concatenate(tangents)
     w = np.concatenate(whitened)

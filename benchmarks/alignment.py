@@ -29,7 +29,7 @@ from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment import Aligned, WorldTransform, clocks_and_frames, moved
 from consistency.referee.readers.clocks import clock_shift
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, make_poses
 from consistency.referee.types import Array
 
 SEED, RUNS, STEPS, DRAWS, OFTEN, FEWER, QUICK = 20261123, 60, 400, 500, 400, 100, 20
@@ -173,7 +173,7 @@ def drawn(rng: np.random.Generator, case: Case) -> list[Poses]:
         estimate[:, 2] = wrap(estimate[:, 2])
         place = Places("row {}".format, np.arange(case.steps))
         stated = np.ones(case.steps, bool)
-        runs.append(Poses(place, true_t[rows], estimate, covariance, stated, true_t, truth, "planar", "so2", 0.01))
+        runs.append(make_poses(place, true_t[rows], estimate, covariance, stated, true_t, truth, "planar", "so2", 0.01))
     return runs
 
 
@@ -199,7 +199,7 @@ def verdict(runs: Sequence[Poses], mode: str) -> Verdict:
 
 def evidence(found: Aligned, shift: float) -> Record:
     error = np.stack([p.errors(shift) for p in found.runs])
-    record = make_record("bench", error, np.stack([p.covariance for p in found.runs]))
+    record = make_record("bench", error, np.stack([p.own.covariance for p in found.runs]))
     return replace(record, fit=replace(found.fit, align="none", caption="", unseen=0.0))
 
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from calibration_gates import stationary
@@ -35,7 +34,7 @@ from consistency.referee.geometry import matrices, vectors, wrap
 from consistency.referee.readers.alignment import WorldTransform, moved, skew
 from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, make_poses
 from consistency.referee.types import Array
 
 AXES = {
@@ -48,6 +47,7 @@ SIZES = ((1, 200), (1, 1500), (5, 100), (20, 50), (40, 30))  # runs, steps
 MEMORY = (0.0, 0.5, 0.9, 0.98, 0.999)
 WRONG = ("right", "all", "axis", "bias", "tails", "drift")
 PROMISE = 6 / 1200
+W_FIRST = [0, 1, 2, 6, 3, 4, 5]  # numbers of a pose whose quaternion begins with w
 OF_PLAIN = 4 / 400
 SPREAD = 4.0  # of variances among axes of one kind, at most, where a log does not say otherwise
 Mess = Callable[[Poses], Poses]
@@ -137,7 +137,7 @@ def run_of(rng: np.random.Generator, kind: str, convention: str, e: Array, P: Ar
     if convention == "right":
         truth = vectors(motions(e) @ matrices(own))
     rows = Places("line {}".format, np.arange(steps))
-    return Poses(rows, t, own, P, np.ones(steps, bool), t, truth, manifold, convention, 0.01)  # type: ignore[arg-type]
+    return make_poses(rows, t, own, P, np.ones(steps, bool), t, truth, manifold, convention, 0.01)  # type: ignore[arg-type]
 
 
 def motions(twists: Array) -> Array:
@@ -255,28 +255,28 @@ def factor_of(rng: np.random.Generator, wrong: str, runs: int, steps: int, n: in
 
 
 def reordered(order: list[int]) -> Mess:
-    return lambda p: replace(p, covariance=p.covariance[:, order][:, :, order])
+    return lambda p: p.with_values(covariance=p.own.covariance[:, order][:, :, order])
 
 
 def states_reordered(order: list[int]) -> Mess:
-    return lambda p: replace(reordered(order)(p), estimate=p.estimate[:, order])
+    return lambda p: reordered(order)(p).with_values(estimate=p.own.estimate[:, order])
 
 
 def read_as(convention: str) -> Mess:
-    return lambda p: replace(p, convention=convention)
+    return lambda p: p.with_values(convention=convention)
 
 
 def deviations(p: Poses) -> Poses:
-    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
-    return replace(p, covariance=sigma[:, :, None] * np.eye(sigma.shape[1]))
+    sigma = np.sqrt(np.diagonal(p.own.covariance, axis1=1, axis2=2))
+    return p.with_values(covariance=sigma[:, :, None] * np.eye(sigma.shape[1]))
 
 
 def information(p: Poses) -> Poses:
-    return replace(p, covariance=np.linalg.inv(p.covariance))
+    return p.with_values(covariance=np.linalg.inv(p.own.covariance))
 
 
 def alone(p: Poses) -> Poses:
-    return replace(p, true_t=p.t, truth=p.estimate.copy())
+    return p.with_values(true_t=p.own.t, truth=p.own.estimate.copy())
 
 
 def one_axis(kind: str, axis: int, base: float = 0.05) -> Callable[[float], Array]:
@@ -355,8 +355,8 @@ def smallest(rng: np.random.Generator, name: str, cells: int) -> str:
 
 
 def inverse(p: Poses) -> Poses:
-    turn = Rotation.from_quat(p.estimate[:, 3:]).inv()
-    return replace(p, estimate=np.hstack([-turn.apply(p.estimate[:, :3]), turn.as_quat()]))
+    turn = Rotation.from_quat(p.own.estimate[:, 3:]).inv()
+    return p.with_values(estimate=np.hstack([-turn.apply(p.own.estimate[:, :3]), turn.as_quat()]))
 
 
 def north(p: Poses) -> Poses:
@@ -367,20 +367,20 @@ def north(p: Poses) -> Poses:
 
 def degrees(p: Poses) -> Poses:
     """Variances of angles in deg^2."""
-    scale = np.ones(p.covariance.shape[-1])
+    scale = np.ones(p.own.covariance.shape[-1])
     scale[2 if len(scale) == 3 else slice(3, 6)] = 180.0 / np.pi
-    return replace(p, covariance=p.covariance * np.outer(scale, scale))
+    return p.with_values(covariance=p.own.covariance * np.outer(scale, scale))
 
 
 def heading_degrees(p: Poses) -> Poses:
-    return replace(p, estimate=p.estimate * [1.0, 1.0, 180.0 / np.pi])
+    return p.with_values(estimate=p.own.estimate * [1.0, 1.0, 180.0 / np.pi])
 
 
 def correlations(p: Poses) -> Poses:
     """Deviations on the diagonal, correlations beside them."""
-    sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
-    R = p.covariance / (sigma[:, :, None] * sigma[:, None, :])
-    return replace(p, covariance=np.where(np.eye(sigma.shape[1]) > 0, sigma[:, :, None], R))
+    sigma = np.sqrt(np.diagonal(p.own.covariance, axis1=1, axis2=2))
+    R = p.own.covariance / (sigma[:, :, None] * sigma[:, None, :])
+    return p.with_values(covariance=np.where(np.eye(sigma.shape[1]) > 0, sigma[:, :, None], R))
 
 
 def turned(axes: Callable[[Poses], Array]) -> Mess:
@@ -388,16 +388,16 @@ def turned(axes: Callable[[Poses], Array]) -> Mess:
 
     def mess(p: Poses) -> Poses:
         R = axes(p)
-        T = np.tile(np.eye(p.covariance.shape[-1]), (len(R), 1, 1))
+        T = np.tile(np.eye(p.own.covariance.shape[-1]), (len(R), 1, 1))
         T[:, : R.shape[1], : R.shape[1]] = np.swapaxes(R, 1, 2)
-        return replace(p, covariance=T @ p.covariance @ np.swapaxes(T, 1, 2))
+        return p.with_values(covariance=T @ p.own.covariance @ np.swapaxes(T, 1, 2))
 
     return mess
 
 
 def along(p: Poses) -> Array:
     """Along the true path over ground, to its left, and up."""
-    velocity = np.gradient(p.truth[:, :3], axis=0) * [1.0, 1.0, 0.0]
+    velocity = np.gradient(p.true.values[:, :3], axis=0) * [1.0, 1.0, 0.0]
     forward = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
     up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
     return np.stack([forward, np.cross(up, forward), up], axis=-1)
@@ -405,17 +405,17 @@ def along(p: Poses) -> Array:
 
 def orbital(p: Poses) -> Array:
     """Along the radius, the track and the normal of both."""
-    radius = p.truth[:, :3] / np.linalg.norm(p.truth[:, :3], axis=1, keepdims=True)
-    normal = np.cross(radius, np.gradient(p.truth[:, :3], axis=0))
+    radius = p.true.values[:, :3] / np.linalg.norm(p.true.values[:, :3], axis=1, keepdims=True)
+    normal = np.cross(radius, np.gradient(p.true.values[:, :3], axis=0))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return np.stack([radius, np.cross(normal, radius), normal], axis=-1)
 
 
 def twice_the_heading(p: Poses) -> Array:
     """What is turned by -heading is right when it is turned by twice the heading."""
-    heading = p.estimate[:, 2]
+    heading = p.own.estimate[:, 2]
     if p.manifold == "spatial":
-        heading = Rotation.from_quat(p.estimate[:, 3:]).as_euler("ZYX")[:, 0]
+        heading = Rotation.from_quat(p.own.estimate[:, 3:]).as_euler("ZYX")[:, 0]
     return Rotation.from_rotvec(2.0 * heading[:, None] * [0.0, 0.0, 1.0]).as_matrix()[:, :2, :2]
 
 
@@ -435,7 +435,7 @@ def large(rng: np.random.Generator, kind: str) -> Array:
 # kind of mix-up: variants of kind of state, true convention, sizes, mix-up, words of the hint
 GROSS: dict[str, list[tuple[str, str | None, Callable[[np.random.Generator, str], Array], Mess, tuple[str, ...]]]] = {
     "quaternion order": [
-        ("spatial", None, sizes, lambda p: replace(p, estimate=p.estimate[:, [0, 1, 2, 6, 3, 4, 5]]), ("w x y z",)),
+        ("spatial", None, sizes, lambda p: p.with_values(estimate=p.own.estimate[:, W_FIRST]), ("w x y z",)),
     ],
     "left / right error": [
         ("spatial", "left", sizes, read_as("right"), ("'left'",)),
@@ -487,7 +487,7 @@ def gross(rng: np.random.Generator, name: str, number: int, scale: float) -> tup
         rho = MEMORY[rng.integers(len(MEMORY))]
         plain = name.startswith("deviations")
         right = log(rng, kind, runs, steps, rho, sigma=size(rng, kind), convention=convention, correlated=not plain)
-        right = [replace(p, covariance=p.covariance * scale) for p in right]
+        right = [p.with_values(covariance=p.own.covariance * scale) for p in right]
         if name == "unaligned world":
             frame = WorldTransform.about_z(rng.uniform(-3.0, 3.0), rng.normal(0.0, 10.0, 3 if kind == "spatial" else 2))
             mixed = [moved(p, frame) for p in right]
@@ -505,10 +505,10 @@ def median_nees(runs: list[Poses]) -> float:
     """The median, infinite where a covariance is not positive definite."""
     found = []
     for p in runs:
-        if (np.linalg.eigvalsh(p.covariance) <= 0).any():
+        if (np.linalg.eigvalsh(p.own.covariance) <= 0).any():
             return np.inf
         with np.errstate(all="ignore"):
-            found.append(np.einsum("ki,kij,kj->k", e := p.errors(), np.linalg.inv(p.covariance), e))
+            found.append(np.einsum("ki,kij,kj->k", e := p.errors(), np.linalg.inv(p.own.covariance), e))
     return float(np.median(np.concatenate(found)))
 
 

@@ -27,7 +27,7 @@ from consistency.referee.geometry import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import relative_of
-from consistency.referee.readers.truth_matching import Manifold, Poses
+from consistency.referee.readers.truth_matching import Manifold, Poses, make_poses
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import judge_all
 
@@ -101,7 +101,8 @@ def _run(
     place = Places(lambda row: f"row {row}", np.arange(len(t)))
     manifold: Manifold = "planar" if P.shape[-1] == 3 else "spatial"
     stated = np.ones(len(t), bool)
-    return Poses(place, t, estimate, P, stated, t, truth, manifold, kind, 0.0, cross, run=run, files=(file, file))
+    of_run = {"cross": cross, "run": run, "files": (file, file)}
+    return make_poses(place, t, estimate, P, stated, t, truth, manifold, kind, 0.0, **of_run)
 
 
 def pose_stretch(rng: np.random.Generator, group: str, poses: int, apart: int, ratio: float, run: int) -> Poses:

@@ -25,7 +25,7 @@ from consistency.referee.geometry import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.runs_to_record import Relative
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import Poses, make_poses
 from consistency.referee.system.progress import counted
 from consistency.referee.types import Array, Indices
 
@@ -245,7 +245,7 @@ def _stretch(run: int, windows: DriveWindows, C: Array) -> Poses:
     P = propagated(np.linalg.inv(to_left(D, convention)), C)
     start = np.eye(windows.d + 1)[None]
     t = drive.t[np.append(windows.first, windows.last[-1])]
-    return Poses(
+    return make_poses(
         place=Places(lambda row: f"{drive.name}, window {row}", np.arange(len(t))),
         t=t,
         estimate=vectors(np.concatenate([start, D])),
@@ -276,10 +276,10 @@ def write_motions(stretches: Sequence[Poses], folder: Path) -> list[str]:
     for part in ("motions", "truth"):
         (folder / part).mkdir()
     for each in stretches:
-        file = f"{each.run:03d}-{str(each.files[0]).replace('/', '_')}.tum"
-        covariances = each.covariance.reshape(len(each.t), -1)
-        np.savetxt(folder / "motions" / file, np.column_stack([each.t, each.estimate, covariances]), DIGITS)
-        np.savetxt(folder / "truth" / file, np.column_stack([each.t, each.truth]), DIGITS)
+        file = f"{each.source.run:03d}-{str(each.source.files[0]).replace('/', '_')}.tum"
+        covariances = each.own.covariance.reshape(len(each.own.t), -1)
+        np.savetxt(folder / "motions" / file, np.column_stack([each.own.t, each.own.estimate, covariances]), DIGITS)
+        np.savetxt(folder / "truth" / file, np.column_stack([each.own.t, each.true.values]), DIGITS)
     return ["motions", "truth"]
 
 
@@ -287,10 +287,10 @@ def _write_tables(stretches: Sequence[Poses], folder: Path) -> None:
     """Two tables, with a clock where all stretches have one."""
     motions, truth = [], []
     for each in stretches:
-        keys = np.column_stack([np.full(len(each.t), each.run), np.arange(len(each.t)), each.t])
-        stated = [each.covariance[:, i, j] for i, j in COVARIANCE.values()]
-        motions.append(np.column_stack([keys, each.estimate, *stated]))
-        truth.append(np.column_stack([keys, each.truth]))
+        keys = np.column_stack([np.full(len(each.own.t), each.source.run), np.arange(len(each.own.t)), each.own.t])
+        stated = [each.own.covariance[:, i, j] for i, j in COVARIANCE.values()]
+        motions.append(np.column_stack([keys, each.own.estimate, *stated]))
+        truth.append(np.column_stack([keys, each.true.values]))
     head = np.array(["run", "step", "t", "x", "y", "heading", *COVARIANCE])
     for name, parts in (("motions", motions), ("truth", truth)):
         rows = np.concatenate(parts)

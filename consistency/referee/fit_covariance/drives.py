@@ -152,28 +152,30 @@ def _of_folder(folder: Path, r: Reading) -> list[Poses]:
     for path in files:
         stem = path.name.split(".")[0]
         for poses in _of_one(path, read_table_of_run(path, r, poses_alone=True), r):
-            found.append(replace(poses, name=stem if poses.name == path.stem else f"{stem}, {poses.name}"))
+            own = poses.source.name
+            found.append(poses.with_values(name=stem if own == path.stem else f"{stem}, {own}"))
     return found
 
 
 def _matrices(poses: Poses, r: Reading) -> Array:
     """Estimated poses, (N, d + 1, d + 1)."""
-    finite = np.isfinite(poses.estimate).all(axis=1)
+    finite = np.isfinite(poses.own.estimate).all(axis=1)
     what = "the pose is not finite; end the drive before it, or leave the row out"
-    refuse(~finite, poses.place.__getitem__, what)
-    T = matrices(poses.estimate)
+    refuse(~finite, poses.own.place.__getitem__, what)
+    T = matrices(poses.own.estimate)
     return composed(T) if r.runs.motions else T
 
 
 def _drive(poses: Poses, T: Array, shift: float) -> Drive:
-    t = poses.t + shift
+    name = poses.source.name
+    t = poses.own.t + shift
     known = poses.known(shift)
     if len(known.rows) < 2:
         raise InputError(
-            f"{poses.name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t "
-            f"is {t[0]:.15g} to {t[-1]:.15g}, but {poses.true_t[0]:.15g} to {poses.true_t[-1]:.15g} in the truth"
+            f"{name}: {len(known.rows)} of {len(t)} poses have a truth within {poses.max_dt:g} s (--max-dt); t "
+            f"is {t[0]:.15g} to {t[-1]:.15g}, but {poses.true.t[0]:.15g} to {poses.true.t[-1]:.15g} in the truth"
         )
-    return Drive(poses.name, poses.seconds[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))
+    return Drive(name, poses.seconds[known.rows] + shift, known.rows, T[known.rows], matrices(known.truth))
 
 
 class TimedMotions(NamedTuple):
@@ -215,8 +217,8 @@ def clock_offset(drives: Sequence[tuple[Poses, Array]]) -> float:
     """
     parts: list[TimedMotions] = []
     for poses, T in drives:
-        last = np.searchsorted(poses.t, poses.t + LONG)
-        first = np.flatnonzero(last < len(poses.t))
+        last = np.searchsorted(poses.own.t, poses.own.t + LONG)
+        first = np.flatnonzero(last < len(poses.own.t))
         some = first[:: max(len(first) * len(drives) // MOST, 1)]
         for rows in np.array_split(some, -(-PARTS // len(drives))):
             if len(rows):

@@ -36,7 +36,7 @@ from consistency.referee.programs.process import (
     run_program,
     seed_of,
 )
-from consistency.referee.readers.options import Reading, make_reading
+from consistency.referee.readers.options import VALUES, Reading, make_reading
 from consistency.referee.readers.pipeline.program_runs import (
     PATHS,
     ProgramRun,
@@ -188,7 +188,7 @@ def _run(
     here = Path.cwd()
     of_plan = {name: options.pop(name) for name in FOR_PLAN if name in options}
     for name in options:
-        if name not in Reading.__dataclass_fields__:
+        if name not in VALUES:
             raise TypeError(f"monte_carlo: unknown option '{name}'")
     options["truth"] = truth
     for name in PATHS:
@@ -575,7 +575,7 @@ def _are_same(one: Sequence[Estimator], other: Sequence[Estimator]) -> bool:
 
 def _digits(one: Estimator) -> list[bytes]:
     p = one.runs[0]
-    arrays = (p.t, p.estimate, p.truth, p.nis)
+    arrays = (p.own.t, p.own.estimate, p.true.values, p.own.nis)
     return [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
 
 

@@ -116,7 +116,7 @@ def clocks_and_frames(
     found = aligned(name, later, align, judged, frames if shift == before else None)
     as_before = []
     for p, own in zip(found.runs, runs, strict=True):
-        as_before.append(replace(p, t=own.t))
+        as_before.append(p.with_values(t=own.own.t))
     return shift, notes, replace(found, runs=as_before)
 
 
@@ -167,7 +167,7 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         if len(sound.rows):
             some.append(i)
             residuals.append(sound.whitened)
-            tangents.append(tangent(p, sound, free, judged))
+            tangents.append(tangent(p, sound, free))
     of = "each run"
     if for_all:
         bases = orthonormal(tangents)
@@ -196,7 +196,7 @@ def _fitted(name: str, runs: Sequence[Poses], mode: str, judged: Sequence[int]) 
         largest = max(largest, of_run)
     out = list(runs)
     for i, share in zip(some, kept, strict=True):
-        out[i] = replace(runs[i], covariance=runs[i].covariance * share)
+        out[i] = runs[i].with_values(covariance=runs[i].own.covariance * share)
     taken = 100.0 * (1.0 - kept.mean())
     notes = (f"{name}: the frame takes {taken:.2g} % of the NEES of a right covariance, made up for",)
     if not for_all:
@@ -260,7 +260,7 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
         No estimate is finite and has a truth and a covariance.
     """
     row, truth = _first(name, p)
-    own = p.estimate[[row]]
+    own = p.own.estimate[[row]]
     true = truth[None]
     turns = rotations(true, p.manifold) * rotations(own, p.manifold).inv()
     turn = turns[0]
@@ -271,8 +271,8 @@ def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
 def _first(name: str, p: Poses) -> tuple[int, Array]:
     """Row of the first estimate that is finite and has a truth and a covariance, and its truth (m,)."""
     known = p.known()
-    fine = p.stated[known.rows] & finite_rows(p.estimate[known.rows])
-    fine &= finite_rows(p.covariance[known.rows])
+    fine = p.own.stated[known.rows] & finite_rows(p.own.estimate[known.rows])
+    fine &= finite_rows(p.own.covariance[known.rows])
     if not fine.any():
         raise InputError(f"--align origin: a run of {name} has no estimate with a truth and a covariance to begin at")
     k = int(np.argmax(fine))
@@ -294,33 +294,33 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     row, _ = _first(name, p)
     sound = sound_of(p, judged)
     seen = submatrices(_seen(name, p, row, sound), judged)
-    own = submatrices(p.covariance[sound.rows], judged)
+    own = submatrices(p.own.covariance[sound.rows], judged)
     ratio = np.linalg.solve(own, seen)
     size = np.trace(ratio, axis1=1, axis2=2) / len(judged)
     t = np.sqrt(np.maximum(size, 0.0))
     wide = t[:, None, None]
     bound = (1.0 + wide) * own + seen + seen / np.where(wide > 0, wide, 1.0)
-    P = p.covariance.copy()
+    P = p.own.covariance.copy()
     index = np.array(judged)
     mirrored = np.swapaxes(bound, 1, 2)
     P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + mirrored)
     P[row] = 0.0
-    return replace(p, covariance=P), np.square(1.0 + t[sound.rows != row])
+    return p.with_values(covariance=P), np.square(1.0 + t[sound.rows != row])
 
 
 def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
     """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
-    n = p.covariance.shape[-1]
+    n = p.own.covariance.shape[-1]
     free = np.eye(6)
     if n == 3:
         free = free[[0, 1, 5]]
-    alike = np.tile(np.eye(n), (len(p.t), 1, 1))
-    plain = replace(p, covariance=alike)
+    alike = np.tile(np.eye(n), (len(p.own.t), 1, 1))
+    plain = p.with_values(covariance=alike)
     _, truth = _first(name, p)
-    first = Sound(np.array([row]), truth[None], np.zeros((1, n)))
-    of_first = tangent(plain, first, free, range(n))[0]
-    J = tangent(plain, sound, free, range(n)) @ np.linalg.inv(of_first)
-    return np.asarray(J @ p.covariance[row] @ np.swapaxes(J, 1, 2))
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
+    of_first = tangent(plain, first, free)[0]
+    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
+    return np.asarray(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2))
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,8 @@ class Sound:
 
     rows: Indices  # (k,)
     truth: Array  # (k, m)
-    whitened: Array  # (k, n), errors, of the components that are judged
+    whitened: Array  # (k, n), errors of the components that are judged
+    judged: Sequence[int]  # (n,)
 
 
 def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sound:
@@ -337,20 +338,20 @@ def sound_of(p: Poses, judged: Sequence[int], known: Known | None = None) -> Sou
     if known is None:
         known = p.known()
     w = _whitened(p, known.rows, p.error_of(known.rows, known.truth), judged)
-    fine = finite_rows(w) & p.stated[known.rows]
-    return Sound(known.rows[fine], known.truth[fine], w[fine])
+    fine = finite_rows(w) & p.own.stated[known.rows]
+    return Sound(known.rows[fine], known.truth[fine], w[fine], judged)
 
 
 def _whitened(p: Poses, rows: Indices, error: Array, judged: Sequence[int]) -> Array:
     index = list(judged)
 
     def of_block(e: Array, at: Indices) -> Array:
-        return whiten(e[:, index], submatrices(p.covariance[at], index))
+        return whiten(e[:, index], submatrices(p.own.covariance[at], index))
 
     return by_runs(of_block, error, rows)
 
 
-def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array:
+def tangent(p: Poses, sound: Sound, free: Array) -> Array:
     """Change of the whitened errors with a small motion of the world of the estimates, (k, n, d).
 
     The truth is moved the other way instead: errors and covariances are carried alike, so that the whitened errors
@@ -362,12 +363,12 @@ def tangent(p: Poses, sound: Sound, free: Array, judged: Sequence[int]) -> Array
     """
 
     def of_block(truth: Array, rows: Indices) -> Array:
-        out = np.empty((len(rows), len(judged), len(free)))
+        out = np.empty((len(rows), len(sound.judged), len(free)))
         for k, motion in enumerate(DIFFERENCE * free):
             after = p.error_of(rows, _small(-motion).placed(truth, p.manifold))
             before = p.error_of(rows, _small(motion).placed(truth, p.manifold))
             change = (after - before) / (2.0 * DIFFERENCE)
-            out[:, :, k] = _whitened(p, rows, change, judged)
+            out[:, :, k] = _whitened(p, rows, change, sound.judged)
         return out
 
     return by_runs(of_block, sound.truth, sound.rows)
@@ -402,7 +403,7 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     if not any(len(sound.rows) for _, sound in found):
         raise InputError(f"--align: no estimate of {name} has a truth and a covariance of full rank to be aligned by")
     for _ in range(FRAME_ROUNDS):
-        step, size = _step(found, free, judged)
+        step, size = _step(found, free)
         further = _small(step @ free).after(frame)
         while size > DONE and (tried := at(further))[0] > nees:
             step = 0.5 * step
@@ -415,12 +416,12 @@ def frame_of_least_nees(name: str, runs: Sequence[Poses], free: Array, judged: S
     return frame
 
 
-def _step(found: Sequence[tuple[Poses, Sound]], free: Array, judged: Sequence[int]) -> tuple[Array, float]:
+def _step(found: Sequence[tuple[Poses, Sound]], free: Array) -> tuple[Array, float]:
     """Gauss-Newton step (d,), and its length in stated standard deviations."""
     tangents = []
     whitened = []
     for p, sound in found:
-        tangents.append(tangent(p, sound, free, judged).reshape(-1, len(free)))
+        tangents.append(tangent(p, sound, free).reshape(-1, len(free)))
         whitened.append(sound.whitened.ravel())
     A = np.concatenate(tangents)
     w = np.concatenate(whitened)
@@ -491,16 +492,16 @@ IDENTITY = WorldTransform(Rotation.identity(), np.zeros(3))
 
 def moved(p: Poses, frame: WorldTransform) -> Poses:
     """The estimates in another world, with their covariance."""
-    estimate = frame.placed(p.estimate, p.manifold)
+    estimate = frame.placed(p.own.estimate, p.manifold)
     if p.convention in CHARTS:
-        finite = finite_rows(p.estimate)
-        before, after = (matrices(poses[finite]) for poses in (p.estimate, estimate))
+        finite = finite_rows(p.own.estimate)
+        before, after = (matrices(poses[finite]) for poses in (p.own.estimate, estimate))
         J = from_left(after, p.convention) @ to_left(before, p.convention)
-        covariance = p.covariance.copy()
-        covariance[finite] = propagated(J, p.covariance[finite])
-        return replace(p, estimate=estimate, covariance=covariance)
-    T = carried(p.convention, frame, p.covariance.shape[-1])
-    return replace(p, estimate=estimate, covariance=T @ p.covariance @ T.T)
+        covariance = p.own.covariance.copy()
+        covariance[finite] = propagated(J, p.own.covariance[finite])
+        return p.with_values(estimate=estimate, covariance=covariance)
+    T = carried(p.convention, frame, p.own.covariance.shape[-1])
+    return p.with_values(estimate=estimate, covariance=T @ p.own.covariance @ T.T)
 
 
 def carried(convention: str, frame: WorldTransform, n: int) -> Array:
@@ -570,7 +571,7 @@ def _positions(runs: Sequence[Poses]) -> tuple[Array, Array]:
 def matched(p: Poses) -> tuple[Array, Array]:
     """Estimates that are finite and have a truth, and that truth, (k, m) both."""
     known = p.known()
-    estimate = p.estimate[known.rows]
+    estimate = p.own.estimate[known.rows]
     finite = finite_rows(estimate)
     return estimate[finite], known.truth[finite]
 
@@ -608,19 +609,19 @@ def on_body(p: Poses, body: BodyTransform) -> Poses:
 
     The left error of T B is Ad(B)^-1 e of the left error e of T (Sola et al. 2018, eq. 175).
     """
-    finite = finite_rows(p.estimate)
+    finite = finite_rows(p.own.estimate)
     pose = [*body.arm, *body.turn.as_quat()]
     if p.manifold == "planar":
         pose = [*body.arm[:2], body.turn.as_rotvec()[2]]
     B = matrices(np.array([pose]))
-    T = matrices(p.estimate[finite])
+    T = matrices(p.own.estimate[finite])
     other = T @ B
     J = from_left(other, p.convention) @ adjoint(inverse(B)) @ to_left(T, p.convention)
-    estimate = p.estimate.copy()
-    covariance = p.covariance.copy()
+    estimate = p.own.estimate.copy()
+    covariance = p.own.covariance.copy()
     estimate[finite] = vectors(other)
-    covariance[finite] = propagated(J, p.covariance[finite])
-    return replace(p, estimate=estimate, covariance=covariance)
+    covariance[finite] = propagated(J, p.own.covariance[finite])
+    return p.with_values(estimate=estimate, covariance=covariance)
 
 
 def skew(v: Array) -> Array:

@@ -58,24 +58,24 @@ def in_axes_of_estimates(e: Estimator, r: Reading) -> Estimator:
     given = r.given(OF_AXES)
     if not given:
         return e
-    are_poses = e.in_space or tuple(e.axes) == ("x", "y", "heading")
+    are_poses = e.error.in_space or tuple(e.error.axes) == ("x", "y", "heading")
     if e.innovations_alone or not are_poses:
         raise InputError(f"{flag_of(given[0])}: needs poses or positions with a truth; {e.path} has none")
-    own, true = axes_of_files(r, e.in_space)
+    own, true = axes_of_files(r, e.error.in_space)
     world = _matrix("--world", own.world, WORLD).T @ _matrix("--truth-world", true.world, WORLD)
     body = _matrix("--body-axes", own.body, BODY).T @ _matrix("--truth-body-axes", true.body, BODY)
     if np.array_equal([world, body], [np.eye(3)] * 2):
         return e
-    if not e.in_space and abs(world[2, 2] + body[2, 2]) != 2.0:
+    if not e.error.in_space and abs(world[2, 2] + body[2, 2]) != 2.0:
         raise InputError(
             f"{flag_of(given[0])}: in the plane, as in {e.path}, the third axes of world and body must be both up "
             f"or both down; the estimates are in {own.world} and {own.body}, the truth in {true.world} and {true.body}"
         )
-    runs = [_with_truth(p, Change(world, body), e.in_space) for p in e.runs]
+    runs = [_with_truth(p, Change(world, body), e.error.in_space) for p in e.runs]
     what = (
         f"the truth, in {true.world} and {true.body}, is read in the axes of the estimates, {own.world} and {own.body}"
     )
-    return replace(e, runs=runs, notes=(*e.notes, f"{e.said}: {what} (world, body)"))
+    return replace(e, runs=runs).with_notes(f"{e.said}: {what} (world, body)")
 
 
 def axes_of_files(r: Reading, in_space: bool) -> tuple[Axes, Axes]:
@@ -113,8 +113,8 @@ def _matrix(option: str, letters: str, directions: Mapping[str, Array]) -> Array
 def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
     """A run with its truth in other axes, and the covariance of that truth."""
     A, C = change
-    truth = p.truth.copy()
-    P = p.true_covariance
+    truth = p.true.values.copy()
+    P = p.true.covariance
     if not in_space:
         truth[:, :2] = truth[:, :2] @ A[:2, :2].T
         start = A @ C.T
@@ -133,7 +133,7 @@ def _with_truth(p: Poses, change: Change, in_space: bool) -> Poses:
                 truth[:, first : first + 3] = truth[:, first : first + 3] @ axes.T
     if P is not None:
         P = _carried(P, p.convention, change, in_space)
-    return replace(p, truth=truth, true_covariance=P)
+    return p.with_values(truth=truth, true_covariance=P)
 
 
 def _carried(P: Array, convention: str, change: Change, in_space: bool) -> Array:
@@ -170,7 +170,7 @@ def require_radians(file: str, runs: Sequence[Poses]) -> None:
         poses = []
         beyond = False
         for p in runs:
-            values = getattr(p, name)
+            values = p.value(name)
             finite = values[finite_rows(values)]
             poses.append(finite)
             beyond |= bool((np.abs(finite[:, 2]) > 2.0 * np.pi + 0.1).any())
@@ -228,8 +228,8 @@ def fit_in_degrees(runs: Sequence[Poses]) -> bool:
     variances = []
     for p in runs:
         known = p.matched()
-        gaps.append(known.truth[:, 2] - known.estimate[:, 2])
-        variances.append(known.covariance[:, 2, 2])
+        gaps.append(known.true.values[:, 2] - known.own.estimate[:, 2])
+        variances.append(known.own.covariance[:, 2, 2])
     gap = np.concatenate(gaps)
     variance = np.concatenate(variances)
     some = np.isfinite(gap) & (variance > np.pi**2)

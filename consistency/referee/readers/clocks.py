@@ -78,7 +78,7 @@ class Sample:
 def sample_of(poses: Poses, axes: Sequence[int]) -> Sample:
     """The finite estimates of a run, with the factors of their covariances."""
     poses = poses.sound()
-    P = submatrices(poses.covariance, axes)
+    P = submatrices(poses.own.covariance, axes)
     columns = [whiten(np.broadcast_to(unit, P.shape[:2]), P) for unit in np.eye(len(axes))]
     return Sample(poses, axes, np.stack(columns, axis=-1))
 
@@ -90,8 +90,8 @@ def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> li
     far beyond its variance.
     """
     if judged is None:
-        judged = range(runs[0].covariance.shape[-1])
-    idle = unchanging(runs, [p.estimate for p in runs])
+        judged = range(runs[0].own.covariance.shape[-1])
+    idle = unchanging(runs, [p.own.estimate for p in runs])
     axes = [i for i in judged if not idle[i]] or list(judged)
     return [sample_of(runs[k], axes) for k in evenly(len(runs), RUNS)]
 
@@ -223,8 +223,8 @@ def _estimate_sums(sample: Sample, parts: int) -> Array:
     e, v = _errors_and_motion(sample, 0.0)
     poses = sample.poses
     rows = np.arange(len(e) - 2)
-    before = np.full(poses.covariance.shape[:2], np.nan)
-    before[2:] = poses.error_of(rows, poses.estimate[1:-1])
+    before = np.full(poses.own.covariance.shape[:2], np.nan)
+    before[2:] = poses.error_of(rows, poses.own.estimate[1:-1])
     return _sums_of_parts(sample.whitened(before), e, v, parts)
 
 

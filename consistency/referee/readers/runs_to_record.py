@@ -379,13 +379,13 @@ def estimated_components(e: Estimator, errors: Sequence[Array], judged: Sequence
     variances = []
     of_part = []
     for p, error in zip(e.runs, errors, strict=True):
-        variances.append(p.variances[p.stated][:, part])
+        variances.append(p.variances[p.own.stated][:, part])
         of_part.append(error[:, part])
     idle = not_estimated(of_part, variances)
     if not idle.any():
         return list(judged), []
-    names = ", ".join(np.array(e.axes)[part[idle]])
-    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.axes)} judges them, too"
+    names = ", ".join(np.array(e.error.axes)[part[idle]])
+    note = f"{e.said}: {names} are {STILL}; --axes {','.join(e.error.axes)} judges them, too"
     return part[~idle].tolist(), [note]
 
 
@@ -398,10 +398,10 @@ def level_components(e: Estimator, judged: Sequence[int]) -> tuple[list[int], li
     part = list(judged)
     near = []
     for p in e.runs:
-        from_, to = p.t.min(initial=np.inf) - BESIDE, p.t.max(initial=-np.inf) + BESIDE
-        near.append(p.truth[(p.true_t >= from_) & (p.true_t <= to)])
-    fixed = unchanging(e.runs, [p.estimate for p in e.runs])[part]
-    variance = np.concatenate([p.variances[p.stated][:, part] for p in e.runs])
+        from_, to = p.own.t.min(initial=np.inf) - BESIDE, p.own.t.max(initial=-np.inf) + BESIDE
+        near.append(p.true.values[(p.true.t >= from_) & (p.true.t <= to)])
+    fixed = unchanging(e.runs, [p.own.estimate for p in e.runs])[part]
+    variance = np.concatenate([p.variances[p.own.stated][:, part] for p in e.runs])
     variance = variance[~np.isnan(variance).any(axis=1)]
     constant = np.isclose(variance, variance[:1], rtol=NO_ERROR, atol=0.0).all(axis=0)
     none = (np.abs(variance) <= ROUNDED.zero).all(axis=0)
@@ -409,7 +409,7 @@ def level_components(e: Estimator, judged: Sequence[int]) -> tuple[list[int], li
     if not fixed.any() or idle.all() or (none & ~idle).any():  # a variance may be in the wrong row
         return part, []
     notes = []
-    names = np.array(e.axes)[part]
+    names = np.array(e.error.axes)[part]
     for which, what, left in ((idle, f"are {LEVEL}", ~idle), (fixed & ~idle, FIXED, ~fixed)):
         if which.any():
             notes.append(f"{e.said}: {', '.join(names[which])} {what.format(','.join(names[left]), ','.join(names))}")
@@ -425,7 +425,7 @@ def unchanging(runs: Sequence[Poses], states: Sequence[Array]) -> Indices:
     ----------
     states : (k, m) of each run, estimates or truth
     """
-    n = runs[0].covariance.shape[-1]
+    n = runs[0].own.covariance.shape[-1]
     found = np.zeros((0, n), bool)
     for p, values in zip(runs, states, strict=True):
         values = values[finite_rows(values)]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -154,97 +154,147 @@ def _bends(position: Array, after: Indices) -> Array:
     return np.asarray(np.maximum(second(after), second(after + 1)) / 8.0)
 
 
-OF_ESTIMATES = ("t", "estimate", "covariance", "stated", "cross", "clock", "nis", "nis_dof", "bounds", "by", "apart",
-                "bend", "members")  # fmt: skip
-OF_TRUTH = ("true_t", "truth", "true_clock", "true_covariance")
+NAMES_OF_TRUTH = {"true_t": "t", "truth": "values", "true_clock": "clock", "true_covariance": "covariance"}
 
 
 @dataclass(frozen=True)
-class Poses:
-    """One run; N estimates and M samples of the truth.
-
-    ``convention`` is that of the error which the covariance describes. Broken values are NaN.
-    """
+class Estimates:
+    """Estimates of one run as the rows of a file have them, N of them. Broken values are NaN."""
 
     place: Places  # (N,), "est.csv, line 7"
     t: Array  # (N,), s, or numbers of steps, increasing
     estimate: Array  # (N, m)
     covariance: Array  # (N, n, n)
     stated: Array  # (N,) of bool: there is a covariance
-    true_t: Array  # (M,), s or numbers of steps, increasing
-    truth: Array  # (M, m)
-    manifold: Manifold
-    convention: str
-    max_dt: float  # s
     cross: Array | None = None  # (N, n, n), E e_before e' with the row before
-    true_covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
+    clock: Array | None = None  # (N,), s, where t are numbers of steps
+    nis: Array | None = None  # (N,)
+    nis_dof: Array | None = None  # (N,)
+    bounds: Array | None = None  # (N, bounds, 2), distance from the estimate to the lower and upper end of bounds
+    by: Array | None = None  # (N,), cells of the column that makes groups, or their values
+    members: Array | None = None  # (N, m, n), whose mean the estimate is; the error is then that of their ranks
+
+    def of_rows(self, rows: Indices) -> Estimates:
+        """Some of the estimates."""
+        if len(rows) == len(self.t):
+            return self
+        return replace(self, place=self.place.at(rows), **_rows_of(self, rows))
+
+
+@dataclass(frozen=True)
+class TrueStates:
+    """Samples of the truth of one run, M of them."""
+
+    t: Array  # (M,), s or numbers of steps, increasing
+    values: Array  # (M, m)
+    clock: Array | None = None  # (M,), s, where t are numbers of steps
+    covariance: Array | None = None  # (M, n, n), of the truth's own error in the convention; NaN where it has none
+
+    def of_rows(self, rows: Indices) -> TrueStates:
+        """Some of the samples."""
+        return replace(self, **_rows_of(self, rows))
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """How far the truth beside N estimates is from its samples, as in :class:`Known`."""
+
+    apart: Array  # (N,), s
+    bend: Array  # (N,)
+
+    def of_rows(self, rows: Indices) -> Interpolation:
+        """That of some of the estimates."""
+        return replace(self, **_rows_of(self, rows))
+
+
+@dataclass(frozen=True)
+class RunSource:
+    """Which run poses are of, and the files that hold it."""
+
     run: int = 0
     name: str = ""  # of a drive
     files: Files = ("the estimates", "the truth")
     numbered: bool = False  # t are numbers of steps
-    clock: Array | None = None  # (N,), s, where t are numbers of steps
-    true_clock: Array | None = None  # (M,), s
-    nis: Array | None = None  # (N,)
-    nis_dof: Array | None = None  # (N,)
-    members: Array | None = None  # (N, m, n), whose mean the estimate is; the error is then that of their ranks
-    bounds: Array | None = None  # (N, bounds, 2), distance from the estimate to the lower and upper end of bounds
-    by: Array | None = None  # (N,), cells of the column that makes groups, or their values
     open_end: str = ""  # the last row stands in a line without an end: what to note if it is cut short
-    apart: Array | None = None  # (N,), s to the nearest sample of a truth that was matched
-    bend: Array | None = None  # (N,), what that truth may be off by, as in :class:`Known`
+
+
+@dataclass(frozen=True)
+class Poses:
+    """One run: estimates, and samples of the truth. :func:`make_poses` makes it of arrays."""
+
+    own: Estimates
+    true: TrueStates
+    manifold: Manifold
+    convention: str  # of the error which the covariance describes
+    max_dt: float  # s
+    source: RunSource = RunSource()
+    interpolation: Interpolation | None = None  # of a truth that was matched
+
+    def value(self, name: str) -> Any:
+        """A value by its name in :func:`make_poses`."""
+        part, field = PLACES[name]
+        return getattr(getattr(self, part), field) if part else getattr(self, field)
+
+    def with_values(self, **values: Any) -> Poses:
+        """The run with other values, by their names in :func:`make_poses`.
+
+        Raises
+        ------
+        KeyError
+            There is no such value.
+        """
+        changed: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            part, field = PLACES[name]
+            changed.setdefault(part, {})[field] = value
+        of_run = changed.pop("", {})
+        return replace(self, **{part: replace(getattr(self, part), **own) for part, own in changed.items()}, **of_run)
 
     def known(self, shift: float = 0.0) -> Known:
         """The truth at the timestamps, ``shift`` s later."""
-        if self.true_t is self.t and not shift:  # beside the estimates
-            rows = np.arange(len(self.t))
+        if self.true.t is self.own.t and not shift:  # beside the estimates
+            rows = np.arange(len(self.own.t))
             none = np.zeros(len(rows))
-            return Known(rows, self.truth, rows, none, none)
-        return truth_at(self.t + shift, self.true_t, self.truth, self.manifold, self.max_dt)
+            return Known(rows, self.true.values, rows, none, none)
+        return truth_at(self.own.t + shift, self.true.t, self.true.values, self.manifold, self.max_dt)
 
     def matched(self, shift: float = 0.0) -> Poses:
         """The estimates whose truth is known, ``shift`` s later, each with that truth beside it."""
         known = self.known(shift)
-        found = self.of_rows(known.rows)
-        P = self.true_covariance
+        own = self.own.of_rows(known.rows)
+        P = self.true.covariance
         if P is not None:
-            P = P[nearest(found.t + shift, self.true_t, known.before)]
-        return replace(
-            found,
-            true_t=found.t,
-            truth=known.truth,
-            true_covariance=P,
-            true_clock=at(self.true_clock, known.before),
-            apart=known.apart,
-            bend=known.bend,
-        )
+            P = P[nearest(own.t + shift, self.true.t, known.before)]
+        true = TrueStates(own.t, known.truth, at(self.true.clock, known.before), P)
+        return replace(self, own=own, true=true, interpolation=Interpolation(known.apart, known.bend))
 
     def pairs(self, kept: Array) -> Poses:
         """Some of the estimates, by truth values or indices, with the truth beside each of them."""
-        rows = np.arange(len(self.t))[kept]
-        if len(rows) == len(self.t):
+        rows = np.arange(len(self.own.t))[kept]
+        if len(rows) == len(self.own.t):
             return self
         found = self.of_rows(rows).beside(rows)
-        return replace(found, true_t=found.t)
+        return found.with_values(true_t=found.own.t)
 
     def errors(self, shift: float = 0.0) -> Array:
         """Truth less estimate, (N, n), with the truth ``shift`` s later; NaN where one of both is not known."""
         known = self.known(shift)
-        if len(known.rows) == len(self.t):
+        if len(known.rows) == len(self.own.t):
             return self.error_of(known.rows, known.truth)
-        out = np.full(self.covariance.shape[:2], np.nan)
+        out = np.full(self.own.covariance.shape[:2], np.nan)
         out[known.rows] = self.error_of(known.rows, known.truth)
         return out
 
     def error_of(self, rows: Indices, truth: Array) -> Array:
         """Error (k, n) of some rows; NaN where the estimate is not finite."""
-        estimate = self.estimate[rows]
+        estimate = self.own.estimate[rows]
         finite = finite_rows(estimate)
-        out = np.full((len(rows), self.covariance.shape[-1]), np.nan)
-        if self.members is not None:
+        out = np.full((len(rows), self.own.covariance.shape[-1]), np.nan)
+        if self.own.members is not None:
             from consistency.referee.diagnostics.statistics.normal_numbers import SEED, rank_numbers
 
-            rng = np.random.default_rng((SEED, self.run))
-            out[finite] = rank_numbers(self.members[rows][finite], truth[finite], rng)
+            rng = np.random.default_rng((SEED, self.source.run))
+            out[finite] = rank_numbers(self.own.members[rows][finite], truth[finite], rng)
             return out
         error = planar_error
         if self.manifold == "spatial":
@@ -255,69 +305,107 @@ class Poses:
     @property
     def d(self) -> int:
         """2 in the plane, 3 in space."""
-        return 2 if self.covariance.shape[-1] == 3 else 3
+        return 2 if self.own.covariance.shape[-1] == 3 else 3
 
     @property
     def variances(self) -> Array:
         """Diagonals of the covariances, (N, n)."""
-        return np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.diagonal(self.own.covariance, axis1=1, axis2=2)
 
     @property
     def seconds(self) -> Array:
         """Time of each estimate, (N,), s; NaN where steps have none."""
-        if not self.numbered:
-            return self.t
-        if self.clock is None:
-            return np.full(len(self.t), np.nan)
-        return self.clock
+        if not self.source.numbered:
+            return self.own.t
+        if self.own.clock is None:
+            return np.full(len(self.own.t), np.nan)
+        return self.own.clock
 
     def later(self, shift: float) -> Poses:
         if not shift:
             return self
-        return replace(self, t=self.t + shift)
+        return self.with_values(t=self.own.t + shift)
 
     def sound(self) -> Poses:
         """Estimates that are finite, with a finite covariance, in which a variance that counts as none is 0."""
-        finite = finite_rows(self.estimate) & finite_rows(self.covariance)
+        finite = finite_rows(self.own.estimate) & finite_rows(self.own.covariance)
         found = self.of_rows(np.flatnonzero(finite))
         none = np.abs(found.variances) <= ROUNDED.zero
         if not found.variances[none].any():
             return found
-        P = found.covariance.copy()
+        P = found.own.covariance.copy()
         row, component = np.nonzero(none)
         P[row, component, component] = 0.0
-        return replace(found, covariance=P)
+        return found.with_values(covariance=P)
 
     def some(self, most: int) -> Poses:
         """At most ``most`` estimates, evenly chosen."""
-        return self.of_rows(evenly(len(self.t), most))
+        return self.of_rows(evenly(len(self.own.t), most))
 
     def alone(self) -> Poses:
         """Without velocities and biases behind the poses in space."""
-        if self.manifold != "spatial" or self.covariance.shape[-1] == 6:
+        if self.manifold != "spatial" or self.own.covariance.shape[-1] == 6:
             return self
-        return replace(
-            self,
-            estimate=self.estimate[:, :7],
-            covariance=self.covariance[:, :6, :6],
-            truth=self.truth[:, :7],
+        return self.with_values(
+            estimate=self.own.estimate[:, :7],
+            covariance=self.own.covariance[:, :6, :6],
+            truth=self.true.values[:, :7],
         )
 
     def of_rows(self, rows: Indices) -> Poses:
         """Some of the estimates beside all of the truth."""
-        if len(rows) == len(self.t):
+        if len(rows) == len(self.own.t):
             return self
-        return replace(self, place=self.place.at(rows), **self._rows_of(OF_ESTIMATES, rows))
+        interpolation = None if self.interpolation is None else self.interpolation.of_rows(rows)
+        return replace(self, own=self.own.of_rows(rows), interpolation=interpolation)
 
     def beside(self, samples: Indices) -> Poses:
         """The estimates beside some samples of the truth."""
-        return replace(self, **self._rows_of(OF_TRUTH, samples))
-
-    def _rows_of(self, names: Sequence[str], rows: Indices) -> dict[str, Any]:
-        return {name: at(getattr(self, name), rows) for name in names}
+        return replace(self, true=self.true.of_rows(samples))
 
 
+def make_poses(
+    place: Places,
+    t: Array,
+    estimate: Array,
+    covariance: Array,
+    stated: Array,
+    true_t: Array,
+    truth: Array,
+    manifold: Manifold,
+    convention: str,
+    max_dt: float,
+    **others: Any,
+) -> Poses:
+    """One run of arrays by name.
+
+    Parameters
+    ----------
+    others : further values of :class:`Estimates` and :class:`RunSource` by their names; ``true_clock`` and
+        ``true_covariance`` of :class:`TrueStates`
+
+    Raises
+    ------
+    KeyError
+        There is no such value.
+    """
+    own = Estimates(place, t, estimate, covariance, stated)
+    return Poses(own, TrueStates(true_t, truth), manifold, convention, max_dt).with_values(**others)
+
+
+# of each name in make_poses, the value of Poses that has it, and what it is called there
+PLACES = {
+    **{each.name: ("own", each.name) for each in fields(Estimates)},
+    **{each.name: ("source", each.name) for each in fields(RunSource)},
+    **{name: ("true", field) for name, field in NAMES_OF_TRUTH.items()},
+    **{name: ("", name) for name in ("manifold", "convention", "max_dt")},
+}
 Change = Callable[[Poses], Poses]  # what is read otherwise
+
+
+def _rows_of(value: Estimates | TrueStates | Interpolation, rows: Indices) -> dict[str, Any]:
+    """Some rows of all arrays of a value, by name."""
+    return {each.name: at(getattr(value, each.name), rows) for each in fields(value) if each.name != "place"}
 
 
 def at(values: Array | None, rows: Any) -> Array | None:
@@ -376,27 +464,34 @@ class Bounds(NamedTuple):
 
 
 @dataclass(frozen=True)
+class StatedError:
+    """Components of an estimator's error, and what of its covariance is stated."""
+
+    axes: Sequence[str]  # names of the components
+    convention: str = ""  # "" where the file holds errors
+    definition: str = ""  # of the convention, in words
+    stated: Stated = WHOLE
+    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
+    in_space: bool = False  # poses in space, or positions beside such a truth
+    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
+    assumed: bool = False  # its covariance is I, as the files state none
+    bounds: Bounds | None = None  # that are stated in place of covariances
+
+
+@dataclass(frozen=True)
 class Estimator:
     """The runs of one estimator, with what its record is called and what a reader must know of it."""
 
     name: str
     path: Path  # of the estimates, for messages
     runs: Sequence[Poses]
-    axes: Sequence[str]  # names of the components of the error
-    convention: str = ""  # of the error; "" where the file holds errors
-    definition: str = ""  # of the convention, in words
-    stated: Stated = WHOLE
+    error: StatedError
     label: str = ""  # of the estimator in notes; its name if there is none
     covariances: Path | None = None  # file of the covariances; that of the estimates if there is none
     notes: Sequence[str] = ()  # what the files were read as
     causes: Sequence[str] = ()  # mix-ups that are found while reading
-    judged: Sequence[int] | None = None  # components that are estimated; None if the errors tell
-    in_space: bool = False  # poses in space, or positions beside such a truth
-    position: int = 0  # leading components of an estimate that are a position in m, to be drawn
     t: Array | None = None  # (steps,), s, of an archive, whose poses are numbered by its steps from 0 on
     innovations_alone: bool = False  # there is no truth
-    assumed: bool = False  # its covariance is I, as the files state none
-    bounds: Bounds | None = None  # that are stated in place of covariances
     failed: Mapping[int, str] = field(default_factory=dict)  # runs without estimates, and why they have none
     trials: Mapping[int, str] = field(default_factory=dict)  # by run: its seed and truth, equal for the same trial
 
@@ -404,3 +499,11 @@ class Estimator:
     def said(self) -> str:
         """Its name in notes."""
         return self.label or self.name
+
+    def with_notes(self, *notes: str) -> Estimator:
+        """The estimator with more notes behind its own."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def with_error(self, **changes: Any) -> Estimator:
+        """The estimator with other values of its error."""
+        return replace(self, error=replace(self.error, **changes))

@@ -207,7 +207,7 @@ def _without_idle(path: Path, tried: Attempt) -> Attempt:
     idle = np.all([not_estimated([p.errors() for p in e.runs], [p.variances for p in e.runs]) for e in estimators], 0)
     if not idle.any():
         return tried
-    axes = np.array(estimators[0].axes)
+    axes = np.array(estimators[0].error.axes)
     reason = f"{tried.why['state']}; without {', '.join(axes[idle])}, whose errors are 0 in every row"
     return _attempt(path, tried.reading.with_options(state=axes[~idle].tolist()), {**tried.why, "state": reason})
 
@@ -421,19 +421,19 @@ def _facts(found: Estimator | Record) -> Iterator[tuple[str, str]]:
         yield "rows", f"{plural(len(found.run_numbers), 'run')} of {plural(len(found.runs.t), 'step')}"
         return
     runs, first = found.runs, found.runs[0]
-    rows = [len(p.t) for p in runs]
+    rows = [len(p.own.t) for p in runs]
     size = plural(rows[0], "row") if min(rows) == max(rows) else f"{min(rows)} to {max(rows)} rows"
     yield "rows", f"{found.name}: {plural(len(runs), 'run')} of {size}{_span(first.seconds)}"
-    clock = f"{'steps' if first.numbered else 'times'}, {first.t[0]:.10g} to {first.t[-1]:.10g}"
-    if not first.numbered and EPOCH < first.t[0] < 4 * EPOCH:
-        clock += f", from {datetime.fromtimestamp(first.t[0], timezone.utc):%Y-%m-%d %H:%M} UTC"
+    clock = f"{'steps' if first.source.numbered else 'times'}, {first.own.t[0]:.10g} to {first.own.t[-1]:.10g}"
+    if not first.source.numbered and EPOCH < first.own.t[0] < 4 * EPOCH:
+        clock += f", from {datetime.fromtimestamp(first.own.t[0], timezone.utc):%Y-%m-%d %H:%M} UTC"
     yield "clock", clock
     if found.innovations_alone:
         return
     yield "covariance", "; ".join(_covariance(found))
     share = sum(len(p.known().rows) for p in runs) / max(sum(rows), 1)
-    of_truth = "" if first.numbered else _span(first.true_t)
-    yield "truth", f"{plural(len(first.true_t), 'row')}{of_truth}; at {percent(share, 3)} of the estimates"
+    of_truth = "" if first.source.numbered else _span(first.true.t)
+    yield "truth", f"{plural(len(first.true.t), 'row')}{of_truth}; at {percent(share, 3)} of the estimates"
 
 
 def _span(t: Array) -> str:
@@ -445,7 +445,7 @@ def _span(t: Array) -> str:
 
 def _stated(e: Estimator) -> Array:
     """All covariances that are stated, (N, n, n)."""
-    return np.concatenate([p.covariance[p.stated] for p in e.runs])
+    return np.concatenate([p.own.covariance[p.own.stated] for p in e.runs])
 
 
 def _covariance(e: Estimator) -> Iterator[str]:
@@ -455,8 +455,8 @@ def _covariance(e: Estimator) -> Iterator[str]:
         yield "none is stated"
         return
     usual = np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
-    parts = "matrix" if e.stated == WHOLE else "deviations alone" if e.stated.alone else "blocks"
-    yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.axes, usual, strict=True))}"
+    parts = "matrix" if e.error.stated == WHOLE else "deviations alone" if e.error.stated.alone else "blocks"
+    yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.error.axes, usual, strict=True))}"
     same = (variances == variances[0]).all(axis=0)
     value = variances[0]
     for words, some in (
@@ -466,7 +466,7 @@ def _covariance(e: Estimator) -> Iterator[str]:
         ("constant", same & (value > 0) & (value < LARGE)),
     ):
         if some.any() and len(variances) > 1:
-            yield f"{words}: {', '.join(np.array(e.axes)[some])}"
+            yield f"{words}: {', '.join(np.array(e.error.axes)[some])}"
 
 
 def _suspects(e: Estimator) -> Iterator[str]:
@@ -475,19 +475,20 @@ def _suspects(e: Estimator) -> Iterator[str]:
     if len(P) > 1:
         some = np.flatnonzero(P.any(axis=(0, 1))).tolist()  # components with a variance
         bad = int((classify(submatrices(P, some), ROUNDED) != Validity.VALID).sum())
-        if bad and e.stated == WHOLE:
+        if bad and e.error.stated == WHOLE:
             yield f"the covariance of {bad} of {len(P)} rows is not positive definite"
         if (P[0] == P).all():
             yield "the covariance is the same in every row: a number that was set once, rather than a filter's"
-        usual = dict(zip(e.axes, np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0))), strict=True))
+        sigma = np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0)))
+        usual = dict(zip(e.error.axes, sigma, strict=True))
         for unit in (("x", "y", "z"), ("roll", "pitch", "yaw"), ("vx", "vy", "vz")):
             of = {usual[axis]: axis for axis in unit if axis in usual and 0 < usual[axis] ** 2 < LARGE}
             if of and max(of) > UNLIKE * min(of):
                 times = f"{short(max(of) / min(of))} times that of {of[min(of)]}"
                 yield f"the stated deviation of {of[max(of)]} is {times}; one of them may be a placeholder"
-    if e.in_space and e.runs[0].manifold == "spatial":
+    if e.error.in_space and e.runs[0].manifold == "spatial":
         for name, values in (("estimates", "estimate"), ("truth", "truth")):
-            q = np.concatenate([getattr(p, values)[:, 3:7] for p in e.runs])
+            q = np.concatenate([p.value(values)[:, 3:7] for p in e.runs])
             if len(q) > 1 and (q == q[0]).all():
                 yield f"the orientation of the {name} is the same in every row; if it is a placeholder, --axes x,y,z"
 

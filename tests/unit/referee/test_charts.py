@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.geometry import from_left, inverse, log, matrices, spatial_error, state_error, to_left
 from consistency.referee.readers.alignment import WorldTransform, moved
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import make_poses
 
 SIGMA = np.array([0.02, 0.05, 0.03, 0.05, 0.02, 0.08])  # x, y, z, and three of the rotation
 CHARTS = ("rvec", "euler")
@@ -82,11 +82,11 @@ def test_another_world_carries_the_covariance_along(convention, rng):
     true = np.column_stack([own[:, :3] + e[:, :3], rotation(values + e[:, 3:], convention).as_quat()])
     P = np.broadcast_to(np.diag(SIGMA**2), (40, 6, 6)).copy()
     t = np.arange(40.0)
-    p = Poses(None, t, own, P, np.ones(40, bool), t, true, "spatial", convention, 0.0)  # type: ignore[arg-type]
+    p = make_poses(None, t, own, P, np.ones(40, bool), t, true, "spatial", convention, 0.0)  # type: ignore[arg-type]
     world = WorldTransform(Rotation.from_rotvec([0.2, -0.3, 0.5]), np.array([1.0, 2.0, 3.0]))
     q = moved(p, world)
-    error = spatial_error(world.placed(true, "spatial"), q.estimate, convention)
-    there = np.einsum("ki,kij,kj->k", error, np.linalg.inv(q.covariance), error)
+    error = spatial_error(world.placed(true, "spatial"), q.own.estimate, convention)
+    there = np.einsum("ki,kij,kj->k", error, np.linalg.inv(q.own.covariance), error)
     assert_allclose(there, np.square(e / SIGMA).sum(axis=1), rtol=1e-2)
 
 

@@ -28,7 +28,7 @@ from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.geometry import composed, inverse, vectors
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Poses, unstated
+from consistency.referee.readers.truth_matching import make_poses, unstated
 
 SPAN = "10m"
 RIGHT = Ratio(1.0, 0.8, 1.25, 0.1, 10, 250)
@@ -263,7 +263,7 @@ def test_the_mean_of_logarithms_of_few_degrees_of_freedom(rng):
 def bare(t, estimate, true_t, truth, manifold, max_dt):
     """Poses without covariances."""
     place, P = Places("row {}".format, np.arange(len(t))), unstated(len(t), 3 if manifold == "planar" else 6)
-    return Poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
+    return make_poses(place, t, estimate, *P, true_t, truth, manifold, "left", max_dt)
 
 
 def uneven(rng, late, world, number):
@@ -282,7 +282,7 @@ def uneven(rng, late, world, number):
 @pytest.mark.parametrize("world", [World(jumps=2), World(*SPACE)], ids=["plane", "space"])
 def test_an_offset_of_clocks_is_found_from_motions(late, number, world, rng):
     made = uneven(rng, late, world, number)
-    wide = [(replace(poses, max_dt=0.5), T) for poses, T in made]
+    wide = [(poses.with_values(max_dt=0.5), T) for poses, T in made]
     assert clock_offset(wide) == pytest.approx(late, abs=0.02)
 
 
@@ -295,7 +295,7 @@ def test_an_offset_that_nothing_tells_is_refused():
 
 def test_drives_whose_clocks_differ_are_refused(rng):
     made = [*uneven(rng, 0.2, World(), 1), *uneven(rng, -0.8, World(), 1)]
-    wide = [(replace(poses, max_dt=1.0), T) for poses, T in made]
+    wide = [(poses.with_values(max_dt=1.0), T) for poses, T in made]
     with pytest.raises(InputError, match="--time-offset estimate: the motions do not tell it"):
         clock_offset(wide)
 
@@ -304,7 +304,7 @@ def test_the_command_reads_an_offset_that_is_estimated(tmp_path, rng):
     for name in ("est", "truth"):
         (tmp_path / name).mkdir()
     for i, (poses, _) in enumerate(uneven(rng, 0.2, World(), 3)):
-        for name, t, rows in (("est", poses.t, poses.estimate), ("truth", poses.true_t, poses.truth)):
+        for name, t, rows in (("est", poses.own.t, poses.own.estimate), ("truth", poses.true.t, poses.true.values)):
             table = np.column_stack([t, rows])
             np.savetxt(tmp_path / name / f"{i}.csv", table, delimiter=",", header="t,x,y,heading", comments="")
     given = make_reading(truth=tmp_path / "truth", time_offset="estimate", max_dt=0.5)

@@ -31,7 +31,7 @@ from consistency.referee.readers.mix_ups.reading_fit import COST, FACTOR, PIECES
 from consistency.referee.readers.pipeline.relative_motions import causes_of_motions
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import Relative, Track, _singular, symmetric
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import make_poses
 from consistency.testing import assert_consistent
 
 RUNS, STEPS = 3, 60
@@ -58,7 +58,7 @@ def planar(rng, plain=False):
 
 def poses(t, own, P, true, manifold, convention):
     place, stated = Places("line {}".format, np.arange(len(t))), np.ones(len(t), bool)
-    return Poses(place, t, own, np.tile(P, (len(t), 1, 1)), stated, t, true, manifold, convention, 0.01)  # type: ignore[arg-type]
+    return make_poses(place, t, own, np.tile(P, (len(t), 1, 1)), stated, t, true, manifold, convention, 0.01)  # type: ignore[arg-type]
 
 
 def states(e, P):
@@ -67,9 +67,9 @@ def states(e, P):
 
 
 def weighed(p, part, factor):
-    scale = np.ones(p.covariance.shape[-1])
+    scale = np.ones(p.own.covariance.shape[-1])
     scale[part] = factor
-    return replace(p, covariance=p.covariance * np.outer(scale, scale))
+    return p.with_values(covariance=p.own.covariance * np.outer(scale, scale))
 
 
 SWAP = [3, 4, 5, 0, 1, 2]
@@ -83,43 +83,44 @@ MIXED = {
     ),
     "gtsam": (
         lambda rng: spatial(rng, "left"),
-        lambda p: replace(world.reordered(SWAP)(p), convention="so3"),
+        lambda p: world.reordered(SWAP)(p).with_values(convention="so3"),
         "the error is 'left' (--error left) and the covariance has its two blocks in the other order",
     ),
     "quaternions": (
-        spatial, lambda p: replace(p, estimate=p.estimate[:, W_FIRST]),
+        spatial, lambda p: p.with_values(estimate=p.own.estimate[:, W_FIRST]),
         "the quaternions of the estimates are w x y z",
     ),
     "true quaternions": (
-        spatial, lambda p: replace(p, truth=p.truth[:, W_FIRST]), "the quaternions of the truth are w x y z",
+        spatial, lambda p: p.with_values(truth=p.true.values[:, W_FIRST]), "the quaternions of the truth are w x y z",
     ),
     "world to body": (
-        spatial, lambda p: replace(p, estimate=p.estimate * [1, 1, 1, -1, -1, -1, 1]), "turn world into body",
+        spatial, lambda p: p.with_values(estimate=p.own.estimate * [1, 1, 1, -1, -1, -1, 1]), "turn world into body",
     ),
     "variances in degrees": (spatial, world.degrees, "its angles are in degrees"),
     "variances in mm": (spatial, lambda p: weighed(p, slice(0, 3), 1e3), "its positions are in millimetres"),
     "estimates in mm": (
-        spatial, lambda p: weighed(replace(p, estimate=p.estimate * ([1e3] * 3 + [1] * 4)), slice(0, 3), 1e3),
+        spatial, lambda p: weighed(p.with_values(estimate=p.own.estimate * ([1e3] * 3 + [1] * 4)), slice(0, 3), 1e3),
         "the positions of the estimates and their covariance are in millimetres",
     ),
     "truth in mm": (
-        spatial, lambda p: replace(p, truth=p.truth * ([1e3] * 3 + [1] * 4)), "positions of the truth are in millim",
+        spatial, lambda p: p.with_values(truth=p.true.values * ([1e3] * 3 + [1] * 4)),
+        "positions of the truth are in millim",
     ),
     "deviations": (lambda rng: spatial(rng, plain=True), world.deviations, "its diagonal holds standard deviations"),
     "information": (spatial, world.information, "information matrix"),
     "inverse": (spatial, world.inverse, "the poses of the estimates are inverse"),
     "y before x": (
-        spatial, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2, 3, 4, 5, 6]]),
+        spatial, lambda p: p.with_values(estimate=p.own.estimate[:, [1, 0, 2, 3, 4, 5, 6]]),
         "the positions of the estimates are in the order y, x, z; write them as x, y, z",
     ),
     "z before x in all": (
         spatial,
-        lambda p: replace(p, estimate=p.estimate[:, [2, 0, 1, 3, 4, 5, 6]],
-                          covariance=p.covariance[:, [2, 0, 1, 3, 4, 5]][:, :, [2, 0, 1, 3, 4, 5]]),
+        lambda p: p.with_values(estimate=p.own.estimate[:, [2, 0, 1, 3, 4, 5, 6]],
+                          covariance=p.own.covariance[:, [2, 0, 1, 3, 4, 5]][:, :, [2, 0, 1, 3, 4, 5]]),
         "positions and covariance of the estimates are in the order z, x, y; write them as x, y, z",
     ),
     "y before x in the plane": (
-        planar, lambda p: replace(p, estimate=p.estimate[:, [1, 0, 2]]),
+        planar, lambda p: p.with_values(estimate=p.own.estimate[:, [1, 0, 2]]),
         "the positions of the estimates are in the order y, x; write them as x, y",
     ),
     "turned world": (spatial, lambda p: moved(p, WorldTransform.about_z(-np.pi / 4.5, FAR)), "turned by 40."),
@@ -127,7 +128,7 @@ MIXED = {
         planar, world.heading_degrees, "the headings of the estimates are in degrees",
     ),
     "true headings in degrees": (
-        planar, lambda p: replace(p, truth=p.truth * ANGLES), "the headings of the truth are in degrees",
+        planar, lambda p: p.with_values(truth=p.true.values * ANGLES), "the headings of the truth are in degrees",
     ),
     "planar deviations": (
         lambda rng: planar(rng, plain=True), world.deviations, "its diagonal holds standard deviations",
@@ -158,7 +159,7 @@ BESIDE = ["quaternions", "blocks", "gtsam", "turned world", "information", "head
 )
 def test_a_mix_up_is_named_also_beside_a_wrong_scale(name, scale, rng):
     make, mess, words = MIXED[name]
-    runs = [replace(p, covariance=p.covariance * scale) for p in make(rng)]
+    runs = [p.with_values(covariance=p.own.covariance * scale) for p in make(rng)]
     axes = SIX if runs[0].manifold == "spatial" else THREE
     (said,) = hints("est", axes, [mess(p) for p in runs])
     assert said.startswith("est: the NEES")
@@ -168,7 +169,7 @@ def test_a_mix_up_is_named_also_beside_a_wrong_scale(name, scale, rng):
 
 
 def decades(runs):
-    found = fit_of([(p.errors(), p.covariance) for p in runs])
+    found = fit_of([(p.errors(), p.own.covariance) for p in runs])
     assert found is not None
     return found.decades
 
@@ -182,7 +183,7 @@ def test_worlds_of_each_run_are_named(rng):
 @pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
 def test_a_filter_that_is_right_or_wrong_by_itself_gets_no_hint(ratio, rng):
     for name in ("blocks", "gtsam", "deviations", "shifted world", "planar deviations"):
-        runs = [replace(p, covariance=p.covariance / ratio) for p in MIXED[name][0](rng)]
+        runs = [p.with_values(covariance=p.own.covariance / ratio) for p in MIXED[name][0](rng)]
         axes = SIX if runs[0].manifold == "spatial" else THREE
         assert decades(runs)[0] == pytest.approx(np.log10(ratio), abs=0.15)
         assert hints("est", axes, runs) == []
@@ -213,15 +214,15 @@ def test_both_worlds_of_north_and_east_are_named(rng):
         turned = [world.north(p) for p in spatial(rng, plain=True)]
         for p in turned:
             if both:
-                p.estimate[:, 3:] = (Rotation.from_quat(p.estimate[:, 3:]) * down).as_quat()
+                p.own.estimate[:, 3:] = (Rotation.from_quat(p.own.estimate[:, 3:]) * down).as_quat()
         (said,) = hints("est", SIX, turned)
         assert "x north, y east, z down" in said
         assert ("their bodies have z down" in said) == both
     swapped = []
     for p in planar(rng, plain=True):
-        own = np.column_stack([p.estimate[:, 1], p.estimate[:, 0], wrap(np.pi / 2 - p.estimate[:, 2])])
+        own = np.column_stack([p.own.estimate[:, 1], p.own.estimate[:, 0], wrap(np.pi / 2 - p.own.estimate[:, 2])])
         order = [1, 0, 2]
-        swapped.append(replace(p, estimate=own, covariance=p.covariance[:, order][:, :, order]))
+        swapped.append(p.with_values(estimate=own, covariance=p.own.covariance[:, order][:, :, order]))
     (said,) = hints("est", THREE, swapped)
     assert "in a plane of x north, y east" in said
 
@@ -229,25 +230,25 @@ def test_both_worlds_of_north_and_east_are_named(rng):
 @pytest.mark.parametrize("convention", ["so3-body", "left"])
 def test_a_body_that_is_turned_over_takes_its_covariance_along(convention, rng):
     """NEES of a log whose estimates are undone is what it was before."""
-    p = replace(spatial(rng)[0], convention=convention)
+    p = spatial(rng)[0].with_values(convention=convention)
     there = world.north(p)
-    there.estimate[:, 3:] = (
-        Rotation.from_quat(there.estimate[:, 3:]) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    there.own.estimate[:, 3:] = (
+        Rotation.from_quat(there.own.estimate[:, 3:]) * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     ).as_quat()
     S = np.diag([1.0, 1.0, 1.0, 1.0, -1.0, -1.0]) if convention == "so3-body" else np.diag([1.0, -1.0, -1.0] * 2)
-    there = replace(there, covariance=S @ there.covariance @ S)
+    there = there.with_values(covariance=S @ there.own.covariance @ S)
     *_, undo = _ned()
     assert_allclose(decades([undo.change(there)]), decades([p]), atol=1e-9)
 
 
 def test_a_file_beside_itself_and_one_of_few_digits(rng):
     runs = spatial(rng)
-    same = [replace(p, truth=p.estimate.copy()) for p in runs]
-    few = [replace(p, truth=np.round(p.estimate, 7)) for p in runs]
+    same = [p.with_values(truth=p.own.estimate.copy()) for p in runs]
+    few = [p.with_values(truth=np.round(p.own.estimate, 7)) for p in runs]
     for copy in (same, few):
         (said,) = hints("est", SIX, copy)
         assert "truth and estimates seem to be the same file" in said
-    near = [replace(p, truth=p.estimate + 1e-4 * rng.normal(size=p.estimate.shape)) for p in runs]
+    near = [p.with_values(truth=p.own.estimate + 1e-4 * rng.normal(size=p.own.estimate.shape)) for p in runs]
     assert not any("same file" in said for said in hints("est", SIX, near))
     assert not any("same file" in said for said in hints("est", SIX, [p.some(2) for p in same[:1]]))
 
@@ -351,13 +352,13 @@ def fit(*whitened, P=None):
     for w in whitened:
         e = w @ np.linalg.cholesky(P).T
         runs.append(poses(np.arange(len(e)) * 0.1, np.zeros_like(e), P, e, "vector", "vector"))
-    found = fit_of([(p.errors(), p.covariance) for p in runs])
+    found = fit_of([(p.errors(), p.own.covariance) for p in runs])
     assert found is not None
     return found
 
 
 def test_no_guess_that_fits_is_no_hint(rng):
-    runs = [replace(p, covariance=p.covariance / 1000.0) for p in planar(rng)]
+    runs = [p.with_values(covariance=p.own.covariance / 1000.0) for p in planar(rng)]
     assert decades(runs)[0] > 2.5
     assert hints("est", THREE, runs) == []
 
@@ -386,9 +387,9 @@ def test_components_that_are_judged_alone_get_hints(rng):
     """Blocks in the other order beside components without a variance, which would make the whole singular."""
     runs = []
     for p in spatial(rng, plain=True):
-        P = world.reordered(SWAP)(p).covariance
+        P = world.reordered(SWAP)(p).own.covariance
         P[:, 2], P[:, :, 2] = 0.0, 0.0
-        runs.append(replace(p, covariance=P))
+        runs.append(p.with_values(covariance=P))
     assert hints("est", SIX, runs) == []
     (said,) = hints("est", SIX, runs, judged=[0, 1, 3, 4])
     assert "other order (--covariance-order)" in said
@@ -412,7 +413,7 @@ def test_a_nearly_singular_direction_that_turns_is_named_as_that(n, rng):
     v[:, :2] = np.column_stack([np.cos(angle), np.sin(angle)])
     P -= (1.0 - 1e-8) * 0.04 * v[:, :, None] * v[:, None, :]
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    run = replace(states(sigma * rng.normal(size=(400, n)), np.eye(n)), covariance=P)
+    run = states(sigma * rng.normal(size=(400, n)), np.eye(n)).with_values(covariance=P)
     (said,) = hints("est", "xyz"[:n], [run])
     assert "nearly singular in a direction that turns from step to step; look for lost digits" in said
 
@@ -459,8 +460,8 @@ def test_some_steps_whose_covariance_is_wrong_are_no_information_matrix(kind, va
 
 def inverted_and_right(rng, kind, p):
     """A run whose errors have the covariances of another, which are stated as their inverses."""
-    e = np.einsum("kij,kj->ki", np.linalg.cholesky(p.covariance), rng.normal(size=p.covariance.shape[:2]))
-    return world.information(world.run_of(rng, kind, "vector", e, p.covariance))
+    e = np.einsum("kij,kj->ki", np.linalg.cholesky(p.own.covariance), rng.normal(size=p.own.covariance.shape[:2]))
+    return world.information(world.run_of(rng, kind, "vector", e, p.own.covariance))
 
 
 @pytest.mark.parametrize("where, sigma", [(slice(20, 26), 2.0), (slice(0, 8), 4.0), (slice(30, None), 1.0)])
@@ -523,7 +524,7 @@ TURNED = {
 def test_covariances_in_axes_of_the_motion_are_named(name, scale, rng):
     kind, axes, words = TURNED[name]
     sigma = np.array([0.05, 0.4, 0.1, 0.01, 0.01, 0.01] if kind == "spatial" else [0.05, 0.4, 0.1])
-    right = [replace(p, covariance=scale * p.covariance) for p in world.log(rng, kind, 10, 60, 0.0, sigma=sigma)]
+    right = [p.with_values(covariance=scale * p.own.covariance) for p in world.log(rng, kind, 10, 60, 0.0, sigma=sigma)]
     assert not any("covariance of" in said for said in hints("est", world.AXES[kind], right))
     (said,) = hints("est", world.AXES[kind], [world.turned(axes)(p) for p in right])
     assert words in said
@@ -568,12 +569,12 @@ def test_the_motion_of_a_robot_that_stands_is_that_before(rng):
     runs = []
     for p in world.log(rng, "place", 10, 60, 0.0, sigma=sigma, correlated=False):
         stays = np.minimum(np.arange(60), 30)
-        error = p.truth - p.estimate
-        R = world.along(replace(p, truth=p.estimate))
+        error = p.true.values - p.own.estimate
+        R = world.along(p.with_values(truth=p.own.estimate))
         R = R[np.minimum(np.arange(60), 29)]
-        P = np.swapaxes(R, 1, 2) @ p.covariance @ R
-        at = p.estimate[stays]
-        runs.append(replace(p, truth=at, estimate=at - error, covariance=P))
+        P = np.swapaxes(R, 1, 2) @ p.own.covariance @ R
+        at = p.own.estimate[stays]
+        runs.append(p.with_values(truth=at, estimate=at - error, covariance=P))
     (said,) = hints("est", ("x", "y", "z"), runs)
     assert "along and across the motion" in said
 
@@ -595,7 +596,7 @@ def test_deviations_with_correlations_are_named(sigma, rng):
 @pytest.mark.parametrize("name", ["turned world", "shifted world", "lever arm"])
 def test_worlds_and_bodies_are_named_beside_a_scale_of_ten(name, scale, rng):
     make, mess, words = MIXED[name]
-    runs = [replace(mess(p), covariance=scale * mess(p).covariance) for p in make(rng)]
+    runs = [mess(p).with_values(covariance=scale * mess(p).own.covariance) for p in make(rng)]
     (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, runs)
     assert words in said
     assert "in all components" in said
@@ -614,13 +615,13 @@ def test_blocks_of_an_inertial_state_in_another_order_are_named(rng):
     runs = []
     for p in spatial(rng):
         P = np.zeros((STEPS, 9, 9))
-        P[:, :6, :6], P[:, 6:, 6:] = p.covariance, 0.3**2 * np.eye(3)
+        P[:, :6, :6], P[:, 6:, 6:] = p.own.covariance, 0.3**2 * np.eye(3)
         own, error = rng.normal(size=(STEPS, 3)), 0.3 * rng.normal(size=(STEPS, 3))
-        estimate, truth = np.hstack([p.estimate, own]), np.hstack([p.truth, own + error])
-        runs.append(replace(p, estimate=estimate, truth=truth, covariance=P))
+        estimate, truth = np.hstack([p.own.estimate, own]), np.hstack([p.true.values, own + error])
+        runs.append(p.with_values(estimate=estimate, truth=truth, covariance=P))
     axes, order = (*SIX, "vx", "vy", "vz"), [0, 1, 2, 6, 7, 8, 3, 4, 5]
     assert hints("est", axes, runs) == []
-    (said,) = hints("est", axes, [replace(p, covariance=p.covariance[:, order][:, :, order]) for p in runs])
+    (said,) = hints("est", axes, [p.with_values(covariance=p.own.covariance[:, order][:, :, order]) for p in runs])
     assert said.endswith("in the order p,v,R; add --covariance-order p,v,R")
 
 
@@ -709,7 +710,7 @@ def test_runs_are_independent_however_their_nees_spreads(rng):
     for size in (0.3, 0.3, 0.4, 0.4, 1.8):
         e = np.tile(size * sigma * [1.0, -1.0, 1.0], (90, 1))
         runs.append(world.run_of(rng, "planar", "left", e, np.tile(np.diag(sigma**2), (90, 1, 1))))
-    turned = [replace(p, convention="so2") for p in runs]
+    turned = [p.with_values(convention="so2") for p in runs]
     (said,) = hints("est", THREE, turned)
     assert "the error is 'left'" in said
     assert hints("est", THREE, turned[:1]) == []
@@ -742,7 +743,7 @@ def test_a_bias_of_few_standard_deviations_explains_a_large_nees(rng):
     grown = np.exp(0.5 * np.sin(np.linspace(0.0, 6.0, 400)))[:, None]
     e = (rng.normal(size=(400, 2)) @ np.linalg.cholesky(R).T + [3.0, 0.0]) * grown
     P = R * np.square(grown)[:, :, None]
-    run = replace(states(e, R), covariance=P)
+    run = states(e, R).with_values(covariance=P)
     assert decades([run])[0] > 5.0
     assert hints("est", ("a", "b"), [run]) == []
     found, unbiased = fit_of([(e, P)]), fit_of([(e - [3.0, 0.0] * grown, P)])
@@ -755,7 +756,7 @@ def test_one_number_for_all_variances_is_no_covariance_of_an_estimator(rng):
     sigma = np.repeat([0.3, 0.3 * np.pi / 180.0], 3)
     right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
     runs = [world.degrees(p) for p in right]
-    dummy = [replace(p, covariance=np.broadcast_to(0.09 * np.eye(6), p.covariance.shape)) for p in runs]
+    dummy = [p.with_values(covariance=np.broadcast_to(0.09 * np.eye(6), p.own.covariance.shape)) for p in runs]
     assert hints("est", SIX, dummy) == []
     sigma[0] *= 3.0
     right = world.log(rng, "spatial", 20, 50, 0.0, sigma=sigma, correlated=False)
@@ -830,7 +831,7 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng):
         P_, C = (M[:, some][:, :, some] for M in (P, before))
         t = np.arange(400.0)
         place = Places("line {}".format, np.arange(400))
-        track = Poses(place, t, pose, P_, np.ones(400, bool), t, pose + e, "planar", "so2", 0.0, cross=C)
+        track = make_poses(place, t, pose, P_, np.ones(400, bool), t, pose + e, "planar", "so2", 0.0, cross=C)
         return causes_of_motions("est", [track], THREE, range(3), Relative(1.0, "step"))
 
     assert causes([0, 1, 2]) == []
@@ -853,9 +854,9 @@ def test_mix_ups_of_poses_with_cross_covariances_are_named(rng):
 def test_one_triangle_of_36_numbers_is_read(root, said, tmp_path, rng):
     """The upper or lower triangle of a covariance, or of a root, whose mirrored matrix may be no covariance at all."""
     (p,) = world.log(rng, "spatial", 1, 400, 0.0, sigma=np.repeat([0.1, 0.01], 3))
-    M = root(p.covariance).reshape(400, 36)
-    np.savetxt(tmp_path / "est.txt", np.column_stack([p.t, p.estimate, M]), fmt="%.15g")
-    np.savetxt(tmp_path / "truth.txt", np.column_stack([p.t, p.truth]), fmt="%.15g")
+    M = root(p.own.covariance).reshape(400, 36)
+    np.savetxt(tmp_path / "est.txt", np.column_stack([p.own.t, p.own.estimate, M]), fmt="%.15g")
+    np.savetxt(tmp_path / "truth.txt", np.column_stack([p.own.t, p.true.values]), fmt="%.15g")
     record = read(tmp_path / "est.txt", tmp_path / "truth.txt")
     assert_named(record.origin.causes, said)
 
@@ -903,12 +904,12 @@ def test_the_frame_is_found(angle, rng):
     for make, shift in ((spatial, FAR), (planar, FAR[:2])):
         runs = make(rng)
         for p in runs:
-            p.truth[:, : len(shift)] = p.estimate[:, : len(shift)]
+            p.true.values[:, : len(shift)] = p.own.estimate[:, : len(shift)]
         frame = WorldTransform.about_z(angle, shift)
         found = fitted_frame([moved(p, frame) for p in runs])
         assert found.heading == pytest.approx(-angle, abs=1e-9)
         back = moved(moved(runs[0], frame), found)
-        assert_allclose(back.estimate[:, : len(shift)], runs[0].estimate[:, : len(shift)], atol=1e-9)
+        assert_allclose(back.own.estimate[:, : len(shift)], runs[0].own.estimate[:, : len(shift)], atol=1e-9)
         assert not any("world" in note for note in hints("est", SIX if len(shift) == 3 else THREE, runs))
 
 
@@ -929,7 +930,7 @@ def changes_in_space(convention, change, step=1e-6):
         own, after = (
             change(poses(np.zeros(1), each, np.eye(6), each, "spatial", convention)) for each in (IN_SPACE, true)
         )
-        found[:, i] = spatial_error(after.estimate, own.estimate, convention)[0] / step
+        found[:, i] = spatial_error(after.own.estimate, own.own.estimate, convention)[0] / step
     return found
 
 
@@ -938,7 +939,7 @@ def test_errors_are_carried_over_to_another_body(convention):
     """To first order, as those of another world below: in space, and of the plane in its three components."""
     step, body, P = 1e-6, BodyTransform(Rotation.from_rotvec([0.2, -0.5, 0.9]), ARM), np.diag(np.arange(1.0, 7.0))
     found = changes_in_space(convention, lambda p: on_body(p, body), step)
-    moved_P = on_body(poses(np.zeros(1), IN_SPACE, P, IN_SPACE, "spatial", convention), body).covariance[0]
+    moved_P = on_body(poses(np.zeros(1), IN_SPACE, P, IN_SPACE, "spatial", convention), body).own.covariance[0]
     assert_allclose(moved_P, found @ P @ found.T, atol=1e-3)
     plane = np.array([[3.0, -1.0, 0.7]])
     flat = BodyTransform(Rotation.from_euler("z", 0.9), ARM * [1, 1, 0])
@@ -946,8 +947,8 @@ def test_errors_are_carried_over_to_another_body(convention):
     for i, e in enumerate(step * np.eye(3)):
         true = plane_pose(plane, e, kind)
         both = [on_body(poses(np.zeros(1), each, np.eye(3), each, "planar", kind), flat) for each in (plane, true)]
-        J[:, i] = planar_error(both[1].estimate, both[0].estimate, kind)[0] / step
-    moved_P = on_body(poses(np.zeros(1), plane, P[:3, :3], plane, "planar", kind), flat).covariance[0]
+        J[:, i] = planar_error(both[1].own.estimate, both[0].own.estimate, kind)[0] / step
+    moved_P = on_body(poses(np.zeros(1), plane, P[:3, :3], plane, "planar", kind), flat).own.covariance[0]
     assert_allclose(moved_P, J @ P[:3, :3] @ J.T, atol=1e-3)
 
 
@@ -983,7 +984,7 @@ def test_errors_in_the_plane_are_carried_over(convention):
     for i, xi in enumerate(step * np.eye(3)):
         pair = [poses(np.zeros(1), each, np.eye(3), each, "planar", convention) for each in (own, own + xi)]
         change[:, i] = planar_error(own + xi, own, convention)[0] / step
-        both = [moved(p, world).estimate for p in pair]
+        both = [moved(p, world).own.estimate for p in pair]
         found[:, i] = planar_error(both[1], both[0], convention)[0] / step
     assert_allclose(found, carried(convention, world, 3) @ change, atol=1e-4)
 
@@ -993,8 +994,8 @@ def test_errors_in_the_plane_are_carried_over(convention):
 
 def test_the_hint_is_a_note_of_what_was_read(tmp_path, rng):
     p = spatial(rng)[0]
-    for name, values in (("est", p.estimate), ("truth", p.truth), ("P", p.covariance.reshape(STEPS, 36))):
-        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.t, values]), fmt="%.17g")
+    for name, values in (("est", p.own.estimate), ("truth", p.true.values), ("P", p.own.covariance.reshape(STEPS, 36))):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.own.t, values]), fmt="%.17g")
     files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
     wrong = read_recordings(*files, covariance_order="rotation-translation")[0].origin.notes
     assert any("in the other order (--covariance-order)" in note for note in wrong)

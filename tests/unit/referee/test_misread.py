@@ -17,7 +17,7 @@ from consistency.referee.readers.axes_and_units import require_radians
 from consistency.referee.readers.formats.positions import placeholder
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import not_estimated
-from consistency.referee.readers.truth_matching import AXES, REST, Poses
+from consistency.referee.readers.truth_matching import AXES, REST, make_poses
 from consistency.testing import assert_consistent
 
 SURE = 1e-6  # false-alarm rate of a verdict
@@ -272,7 +272,7 @@ def headed(heading, course=None, sigma=0.03, other=None):
     own = heading + sigma * rng.normal(size=heading.shape) if other is None else other
     t, P = np.arange(float(heading.shape[1])), np.diag([1.0, 1.0, sigma**2])
     return [
-        Poses(
+        make_poses(
             Places(str, np.arange(len(t))), t, np.column_stack([p, g]), np.broadcast_to(P, (len(t), 3, 3)),
             np.ones(len(t), bool), t, np.column_stack([p, h]), "planar", "so2", 0.0,
         )
@@ -351,7 +351,7 @@ def turning(heading, course, true=None, sigma=0.01):
     for p, h, q in zip(place, heading, np.zeros(heading.shape) if true is None else true, strict=True):
         turn = Rotation.from_rotvec(sigma * rng.normal(size=(len(t), 3))) * Rotation.from_euler("z", h[:, None])
         world = Rotation.from_euler("z", q[:, None]).as_quat() * rng.choice([-1, 1], (len(t), 1))
-        runs.append(Poses(
+        runs.append(make_poses(
             Places(str, np.arange(len(t))), t, np.column_stack([p, turn.as_quat()]),
             np.broadcast_to(sigma**2 * np.eye(6), (len(t), 6, 6)), np.ones(len(t), bool), t,
             np.column_stack([p, world]), manifold, "so3", 0.0,

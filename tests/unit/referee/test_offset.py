@@ -1,7 +1,5 @@
 """Clocks that differ, on runs whose offset is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +20,7 @@ from consistency.referee.readers.clocks import (
     steps_of,
 )
 from consistency.referee.readers.places import Places
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import make_poses
 
 SIGMA = np.array([0.3, 0.3, 0.02])
 TRUE_T = np.arange(-2.0, 12.0, 0.02)
@@ -38,12 +36,12 @@ def path(rng, speed):
 def run_of(rng, offset, noise=1.0, speed=5.0):
     """100 estimates in 10 s, whose clock is ``offset`` early."""
     t, truth = 0.1 * np.arange(100), path(rng, speed)
-    poses = Poses(
+    poses = make_poses(
         Places("line {}".format, np.arange(100)), t, np.zeros((100, 3)), np.tile(np.diag(SIGMA**2), (100, 1, 1)),
         np.ones(100, bool), TRUE_T, truth, "planar", "so2", 0.01,
     )  # fmt: skip
     estimate = poses.known(offset).truth - noise * SIGMA * rng.normal(size=(100, 3))
-    return replace(poses, estimate=estimate)
+    return poses.with_values(estimate=estimate)
 
 
 def kalman_runs(rng, count, offset=0.0):
@@ -70,12 +68,12 @@ def kalman_runs(rng, count, offset=0.0):
         estimates.append(x)
         covariances.append(P)
     t, place = 0.1 * np.arange(1, 101), Places("line {}".format, np.arange(100))
-    poses = Poses(
+    poses = make_poses(
         place, t - offset, t, np.array(covariances), np.ones(100, bool), 0.01 * np.arange(1101), t, "vector", "vector",
         0.01,
     )  # fmt: skip
     return [
-        replace(poses, estimate=estimate, truth=path)
+        poses.with_values(estimate=estimate, truth=path)
         for estimate, path in zip(np.swapaxes(estimates, 0, 1), np.swapaxes(truth, 0, 1), strict=True)
     ]
 
@@ -198,7 +196,7 @@ def test_estimates_show_an_offset_of_its_own_sign(rng):
     assert shows_in_estimates(samples_of(runs), 0.04)
     assert not shows_in_estimates(samples_of(runs), -0.04)
     assert shows_in_estimates(samples_of([run_of(rng, -0.04, noise=1e-3)]), -0.04)
-    still = [replace(run, estimate=np.zeros_like(run.estimate)) for run in runs]
+    still = [run.with_values(estimate=np.zeros_like(run.own.estimate)) for run in runs]
     assert not shows_in_estimates(samples_of(still), 0.04)
 
 
@@ -232,14 +230,16 @@ def test_the_error_of_a_single_run_is_not_laid_on_the_clock(rng):
 
 def test_where_nothing_moves_there_is_none(rng):
     runs = [run_of(rng, 0.0) for _ in range(4)]
-    still = [replace(run, truth=np.zeros_like(run.truth), estimate=0.1 * SIGMA * run.estimate) for run in runs]
+    still = [
+        run.with_values(truth=np.zeros_like(run.true.values), estimate=0.1 * SIGMA * run.own.estimate) for run in runs
+    ]
     assert offset_of(samples_of(still)) is None
     with pytest.raises(cs.InputError, match="--time-offset estimate: nothing moves in est"):
         clock_shift("est", still, "estimate")
 
 
 def with_covariance(run, scale):
-    return replace(run, covariance=run.covariance * scale)
+    return run.with_values(covariance=run.own.covariance * scale)
 
 
 @pytest.mark.parametrize("offset", [0.35, -0.28, 0.6])
@@ -254,14 +254,14 @@ def test_broken_estimates_decide_nothing(rng):
     """A tenth of the rows, off by 1e4 sigma along x alone."""
     runs = [run_of(rng, 0.04) for _ in range(20)]
     for run in runs:
-        run.estimate[::10, 0] += 1e4 * SIGMA[0]
+        run.own.estimate[::10, 0] += 1e4 * SIGMA[0]
     assert offset_of(samples_of(runs)).value == pytest.approx(0.04, abs=0.02)
 
 
 def test_components_that_are_not_judged_say_nothing(rng):
     runs = [run_of(rng, 0.1) for _ in range(8)]
     for run in runs:
-        run.estimate[:, 1] += 1e3 * rng.normal(size=100)
+        run.own.estimate[:, 1] += 1e3 * rng.normal(size=100)
     assert offset_of(samples_of(runs, [0, 2])).value == pytest.approx(0.1, abs=0.03)
     assert samples_of(runs, [0, 2])[0].axes == [0, 2]
 
@@ -269,19 +269,19 @@ def test_components_that_are_not_judged_say_nothing(rng):
 def test_a_component_that_never_changes_in_the_estimates_says_nothing(rng):
     """A heading of 0 throughout, with errors of many sigma."""
     runs = [run_of(rng, 0.1) for _ in range(8)]
-    still = [replace(run, estimate=run.estimate * [1.0, 1.0, 0.0]) for run in runs]
+    still = [run.with_values(estimate=run.own.estimate * [1.0, 1.0, 0.0]) for run in runs]
     [first, *_] = samples_of(still)
     assert first.axes == [0, 1]
-    P, e = runs[0].covariance[:, :2, :2], still[0].errors(0.0)[:, :2]
+    P, e = runs[0].own.covariance[:, :2, :2], still[0].errors(0.0)[:, :2]
     nees = np.einsum("ki,kij,kj->k", e, np.linalg.inv(P), e)
     assert_allclose(first.squares(0.0), nees / 2.0)
     assert samples_of(still, [2])[0].axes == [2]  # nothing else is judged
 
 
 def test_of_many_runs_some_are_looked_at(rng):
-    runs = [replace(run_of(rng, 0.04), run=number) for number in range(3)]
-    many = [replace(runs[k % 3], run=k) for k in range(200)]
-    numbers = [sample.poses.run for sample in samples_of(many)]
+    runs = [run_of(rng, 0.04).with_values(run=number) for number in range(3)]
+    many = [runs[k % 3].with_values(run=k) for k in range(200)]
+    numbers = [sample.poses.source.run for sample in samples_of(many)]
     assert len(numbers) == clocks.RUNS == 60
     assert numbers == sorted(set(numbers))
     assert (numbers[0], numbers[-1]) == (0, 199)
@@ -298,10 +298,11 @@ def tables(tmp_path, rng):
     for number in range(12):
         run = run_of(rng, 0.1)
         P = {name: SIGMA[i] ** 2 for i, name in enumerate(("P_xx", "P_yy", "P_hh"))}
-        columns = dict(zip(("x", "y", "heading"), run.estimate.T, strict=True))
-        estimates.append(pd.DataFrame({"run": number, "t": run.t} | columns | P | {"P_xy": 0, "P_xh": 0, "P_yh": 0}))
-        true = dict(zip(("x", "y", "heading"), run.truth.T, strict=True))
-        truths.append(pd.DataFrame({"run": number, "t": run.true_t} | true))
+        columns = dict(zip(("x", "y", "heading"), run.own.estimate.T, strict=True))
+        P |= dict.fromkeys(("P_xy", "P_xh", "P_yh"), 0)
+        estimates.append(pd.DataFrame({"run": number, "t": run.own.t} | columns | P))
+        true = dict(zip(("x", "y", "heading"), run.true.values.T, strict=True))
+        truths.append(pd.DataFrame({"run": number, "t": run.true.t} | true))
     pd.concat(estimates).to_csv(tmp_path / "est.csv", index=False)
     pd.concat(truths).to_csv(tmp_path / "truth.csv", index=False)
     return tmp_path
@@ -322,7 +323,7 @@ def test_trajectories_are_read_with_an_offset(tmp_path, rng):
         (tmp_path / folder).mkdir()
     for number in range(6):
         run = run_of(rng, 0.1)
-        for folder, t, pose in (("est", run.t, run.estimate), ("truth", run.true_t, run.truth)):
+        for folder, t, pose in (("est", run.own.t, run.own.estimate), ("truth", run.true.t, run.true.values)):
             half = 0.5 * pose[:, 2]
             zero = np.zeros(len(t))
             up = rng.normal(size=(len(t), 3)) * 0.01 if folder == "est" else np.zeros((len(t), 3))
@@ -330,7 +331,7 @@ def test_trajectories_are_read_with_an_offset(tmp_path, rng):
             turn /= np.linalg.norm(turn, axis=1)[:, None]
             np.savetxt(tmp_path / folder / f"{number}.txt", np.column_stack([t, pose[:, :2], zero + up[:, 0], turn]))
         P = np.diag([*SIGMA[:2] ** 2, 1e-4, 1e-4, 1e-4, SIGMA[2] ** 2]).ravel()
-        np.savetxt(tmp_path / "P" / f"{number}.txt", np.column_stack([run.t, np.tile(P, (len(run.t), 1))]))
+        np.savetxt(tmp_path / "P" / f"{number}.txt", np.column_stack([run.own.t, np.tile(P, (len(run.own.t), 1))]))
     files = tmp_path / "est", tmp_path / "truth", tmp_path / "P"
     early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].errors.nees) for o in (None, "estimate"))  # type: ignore[arg-type]
     assert early > 6.8
@@ -344,9 +345,9 @@ def test_what_has_truth_is_judged_at_every_offset(rng):
     In a truth that ends with the estimates, wrong by 3 sigma in its last second alone, an offset of a second would.
     """
     run = run_of(rng, 0.0, noise=1e-3)
-    within = (run.true_t >= run.t[0]) & (run.true_t <= run.t[-1] + 1e-9)
-    truth = run.truth[within] + 3.0 * SIGMA * (run.true_t[within] > 8.9)[:, None]
-    found = offset_of(samples_of([replace(run, true_t=run.true_t[within], truth=truth)]))
+    within = (run.true.t >= run.own.t[0]) & (run.true.t <= run.own.t[-1] + 1e-9)
+    truth = run.true.values[within] + 3.0 * SIGMA * (run.true.t[within] > 8.9)[:, None]
+    found = offset_of(samples_of([run.with_values(true_t=run.true.t[within], truth=truth)]))
     assert abs(found.value) < 0.5
 
 
@@ -360,7 +361,7 @@ def test_an_offset_that_makes_next_to_nothing_is_not_named(explained, alone, fou
 def test_a_truth_beside_the_estimates_is_that_of_other_times_if_the_clocks_differ(rng, shift):
     p = run_of(rng, 0.0)
     own = p.known(0.0).truth
-    beside, apart = (replace(p, true_t=t, truth=own, max_dt=0.2).known(shift) for t in (p.t, p.t.copy()))
+    beside, apart = (p.with_values(true_t=t, truth=own, max_dt=0.2).known(shift) for t in (p.own.t, p.own.t.copy()))
     assert_allclose(beside.truth, apart.truth)
     assert_array_equal(beside.rows, apart.rows)
     assert np.array_equal(beside.truth, own) == (shift == 0.0)

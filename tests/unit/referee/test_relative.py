@@ -63,7 +63,7 @@ def same(a, b):
 def test_another_world_of_the_truth_changes_no_number_of_motions(group, size, rng):
     stretch = motion_stretch(drive(rng, group, 200))
     G = exp(3.0 * rng.normal(size=(1, len(AXES[group]))))
-    turned = replace(stretch, truth=vectors(G @ matrices(stretch.truth)))
+    turned = stretch.with_values(truth=vectors(G @ matrices(stretch.true.values)))
     same(statistics([stretch], size, True), statistics([turned], size, True))
 
 
@@ -74,15 +74,15 @@ def test_another_world_of_either_changes_no_number_of_poses(group, rng):
     turned = []
     for run in runs:
         G, H = exp(2.0 * rng.normal(size=(2, n)))[:, None]
-        T = matrices(run.estimate)
+        T = matrices(run.own.estimate)
         # the covariance of the same uncertainty, about the axes of the other world
         J = np.linalg.inv(to_left(G @ T, kind)) @ to_left(T, kind)
-        cross = run.cross.copy()
-        cross[1:] = J[:-1] @ run.cross[1:] @ np.swapaxes(J[1:], 1, 2)
+        cross = run.own.cross.copy()
+        cross[1:] = J[:-1] @ run.own.cross[1:] @ np.swapaxes(J[1:], 1, 2)
         turned.append(
-            replace(
-                run, estimate=vectors(G @ T), truth=vectors(H @ matrices(run.truth)),
-                covariance=propagated(J, run.covariance), cross=cross,
+            run.with_values(
+                estimate=vectors(G @ T), truth=vectors(H @ matrices(run.true.values)),
+                covariance=propagated(J, run.own.covariance), cross=cross,
             )
         )  # fmt: skip
     same(statistics(runs, "1", False), statistics(turned, "1", False))
@@ -145,7 +145,7 @@ def test_few_windows_do_not_show_independence(rng):
 
 def test_a_failed_window_stays_failed(rng):
     stretch = pose_stretch(rng, "SE(2)", 30, 5, 1.0, 0)
-    stretch.estimate[20] = np.nan
+    stretch.own.estimate[20] = np.nan
     relative = replace(Relative(1, "step"), independent=True)
     record = world.relative_recording("log", "log", [stretch], AXES["SE(2)"], range(3), relative)
     assert judge_all([record])["log"].status == "failed"
@@ -163,8 +163,8 @@ def lines(path, *columns):
 def motion_file(tmp_path, rng):
     """motions.tum with truth.tum beside it, 120 motions."""
     s = motion_stretch(drive(rng, "SE(3)", 120))
-    lines(tmp_path / "truth.tum", s.t, s.truth)
-    return lines(tmp_path / "motions.tum", s.t, s.estimate, s.covariance.reshape(-1, 36))
+    lines(tmp_path / "truth.tum", s.own.t, s.true.values)
+    return lines(tmp_path / "motions.tum", s.own.t, s.own.estimate, s.own.covariance.reshape(-1, 36))
 
 
 def test_motions_as_tum(motion_file):
@@ -181,10 +181,10 @@ def test_motions_as_tum(motion_file):
 
 def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
     s = pose_stretch(rng, "SE(3)", 9, 5, 1.0, 0)
-    lines(tmp_path / "est.tum", s.t, s.estimate)
-    lines(tmp_path / "truth.tum", s.t, s.truth)
-    cross = np.nan_to_num(s.cross).reshape(-1, 36)
-    P = lines(tmp_path / "P.txt", s.t, s.covariance.reshape(-1, 36), cross)
+    lines(tmp_path / "est.tum", s.own.t, s.own.estimate)
+    lines(tmp_path / "truth.tum", s.own.t, s.true.values)
+    cross = np.nan_to_num(s.own.cross).reshape(-1, 36)
+    P = lines(tmp_path / "P.txt", s.own.t, s.own.covariance.reshape(-1, 36), cross)
     record = cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=1)
     found = windows_of(s, Relative(1, "step"))
     assert_allclose(record.errors.covariance[0], found.covariance, rtol=1e-9)
@@ -192,19 +192,20 @@ def test_poses_with_cross_covariances_as_tum(tmp_path, rng):
     with pytest.raises(cs.InputError, match="line 3: relative=2: the window spans 2 rows"):
         cs.read(tmp_path / "est.tum", tmp_path / "truth.tum", P, relative=2)
     keep = np.arange(9) != 4
-    lines(tmp_path / "some.tum", s.t[keep], s.estimate[keep])
+    lines(tmp_path / "some.tum", s.own.t[keep], s.own.estimate[keep])
     with pytest.raises(cs.InputError, match=r"line 5: no pose of .* has this time"):
         cs.read(tmp_path / "some.tum", tmp_path / "truth.tum", P, relative=1)
 
 
 def table(path, s, cross):
-    columns = {"step": np.arange(len(s.t)), "t": s.t} | dict(zip(("x", "y", "heading"), s.estimate.T, strict=True))
+    pose = ("x", "y", "heading")
+    columns = {"step": np.arange(len(s.own.t)), "t": s.own.t} | dict(zip(pose, s.own.estimate.T, strict=True))
     for i, a in enumerate("xyh"):
         for j, b in enumerate("xyh"):
-            columns |= {f"P_{a}{b}": s.covariance[:, i, j]} if i <= j else {}
-            columns |= {f"C_{a}{b}": s.cross[:, i, j]} if cross and s.cross is not None else {}
+            columns |= {f"P_{a}{b}": s.own.covariance[:, i, j]} if i <= j else {}
+            columns |= {f"C_{a}{b}": s.own.cross[:, i, j]} if cross and s.own.cross is not None else {}
     pd.DataFrame(columns).to_csv(path, index=False)
-    truth = {"step": np.arange(len(s.t)), "t": s.t} | dict(zip(("x", "y", "heading"), s.truth.T, strict=True))
+    truth = {"step": np.arange(len(s.own.t)), "t": s.own.t} | dict(zip(pose, s.true.values.T, strict=True))
     pd.DataFrame(truth).to_csv(path.with_name("truth.csv"), index=False)
     return path
 
@@ -214,7 +215,7 @@ def test_tables_and_archives_of_motions(tmp_path, rng):
     expected = recorded([s], "5", True)
     record = cs.read(table(tmp_path / "m.csv", s, False), tmp_path / "truth.csv", relative="0.5s", motions=True)
     assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
-    np.savez(tmp_path / "m.npz", estimates=s.estimate, truth=s.truth, covariances=s.covariance)
+    np.savez(tmp_path / "m.npz", estimates=s.own.estimate, truth=s.true.values, covariances=s.own.covariance)
     assert_allclose(cs.read(tmp_path / "m.npz", relative=5, motions=True).errors.nees, expected.errors.nees, rtol=1e-9)
     with pytest.raises(cs.InputError, match="relative=1s needs a column t"):
         cs.read(tmp_path / "m.npz", relative="1s", motions=True)
@@ -225,12 +226,13 @@ def test_tables_and_archives_of_poses_with_cross_covariances(tmp_path, rng):
     expected = recorded([s], "1", False)
     record = cs.read(table(tmp_path / "p.csv", s, True), tmp_path / "truth.csv", relative=1)
     assert_allclose(record.errors.nees, expected.errors.nees, rtol=1e-9)
-    arrays = {"estimates": s.estimate, "truth": s.truth, "covariances": s.covariance, "cross_covariances": s.cross}
+    arrays = {"estimates": s.own.estimate, "truth": s.true.values, "covariances": s.own.covariance}
+    arrays["cross_covariances"] = s.own.cross
     np.savez(tmp_path / "p.npz", **arrays)
     assert_allclose(cs.read(tmp_path / "p.npz", relative=1).errors.nees, expected.errors.nees, rtol=1e-9)
     declared = cs.read(tmp_path / "p.npz", relative=1, windows="independent")
     assert cs.judge(declared).runs == 8
-    np.savez(tmp_path / "q.npz", **arrays | {"cross_covariances": s.cross[:4]})
+    np.savez(tmp_path / "q.npz", **arrays | {"cross_covariances": s.own.cross[:4]})
     with pytest.raises(cs.InputError, match="key 'cross_covariances' has shape"):
         cs.read(tmp_path / "q.npz", relative=1)
     data = pd.read_csv(tmp_path / "p.csv").drop(columns="C_yx")

@@ -94,7 +94,7 @@ def test_motions_make_up_the_covariance_of_a_window(group, rng):
 def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group, rng):
     stretch, n, kind = pose_stretch(rng, group, 3, 5, 1.0, 0), len(AXES[group]), DECLARED[group]
     found = windows_of(stretch, NEXT)
-    T = matrices(stretch.estimate)
+    T = matrices(stretch.own.estimate)
     for k in (1, 2):
 
         def window(e, k=k):
@@ -104,7 +104,7 @@ def test_joint_covariance_of_two_poses_makes_up_that_of_a_window(group, rng):
 
         J = numerical(window, 2 * n)
         joint = np.block(
-            [[stretch.covariance[k - 1], stretch.cross[k]], [stretch.cross[k].T, stretch.covariance[k]]]
+            [[stretch.own.covariance[k - 1], stretch.own.cross[k]], [stretch.own.cross[k].T, stretch.own.covariance[k]]]
         )  # fmt: skip
         assert_allclose(found.covariance[k - 1], J @ joint @ J.T, rtol=1e-6, atol=1e-10)
 
@@ -166,7 +166,7 @@ def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng):
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
     truth = np.column_stack([[0.0, 2.0, 2.5, 3.0, 4.1, 6.2, 7.0, 8.3], np.zeros((8, 2))])  # windows of 1, 3, 1, 2 rows
     with pytest.raises(cs.InputError, match="row 4: --relative 2m: the window spans 3 rows"):
-        windows_of(replace(stretch, truth=truth), Relative(2.0, "m"))
+        windows_of(stretch.with_values(truth=truth), Relative(2.0, "m"))
 
 
 # --- what breaks a run ---------------------------------------------------------------------------------
@@ -175,11 +175,11 @@ def test_a_window_that_cross_covariances_do_not_reach_over_is_named(rng):
 @pytest.mark.parametrize("row", [1, 7, 12, 29])
 def test_a_broken_row_is_a_failed_window(row, rng):
     stretch = motion_stretch(drive(rng, "SE(3)", 29))
-    stretch.estimate[row] = np.nan
+    stretch.own.estimate[row] = np.nan
     record = recorded([stretch], "5", True)
     assert [f.reason for f in record.failures] == [f"estimate is not finite (row {row})"]
     found = windows_of(stretch, Relative(5, "step", True))
-    assert (found.track.t[-1], found.t[-1]) == (stretch.t[row - 1], stretch.t[row])
+    assert (found.track.t[-1], found.t[-1]) == (stretch.own.t[row - 1], stretch.own.t[row])
     verdict = judge_all([record])["log"]
     assert verdict.runs == (row - 1) // 5 + 1
     assert verdict.status != "consistent"
@@ -188,7 +188,7 @@ def test_a_broken_row_is_a_failed_window(row, rng):
 
 def test_a_covariance_that_is_not_finite_is_named(rng):
     stretch = motion_stretch(drive(rng, "SE(2)", 20))
-    stretch.covariance[8, 0, 0] = np.inf
+    stretch.own.covariance[8, 0, 0] = np.inf
     assert recorded([stretch], "5", True).failures[0].reason == "covariance is not finite (row 8)"
     found = windows_of(stretch, Relative(5, "step", True))
     assert_array_equal(found.error[-1], 0.0)
@@ -198,11 +198,11 @@ def test_a_covariance_that_is_not_finite_is_named(rng):
 def test_a_log_that_is_broken_from_the_start(rng):
     for group in GROUPS:
         stretch = pose_stretch(rng, group, 6, 5, 1.0, 0)
-        stretch.estimate[0] = np.nan
+        stretch.own.estimate[0] = np.nan
         record = recorded([stretch], "1", False)
         assert [f.reason for f in record.failures] == ["estimate is not finite (row 0)"]
         assert not any("first order" in note for note in record.origin.notes)
-        assert windows_of(stretch, NEXT).track.t.tolist() == [stretch.t[0]]
+        assert windows_of(stretch, NEXT).track.t.tolist() == [stretch.own.t[0]]
         assert judge_all([record])["log"].status == "failed"
 
 
@@ -253,9 +253,9 @@ def test_windows_too_wide_for_first_order_are_named(rng):
 def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there(rng):
     stretch = pose_stretch(rng, "SE(2)", 8, 5, 1.0, 0)
     whole = windows_of(stretch, NEXT)
-    stretch.cross[4, 2, 0] = np.inf
+    stretch.own.cross[4, 2, 0] = np.inf
     found = windows_of(stretch, NEXT)
-    assert_array_equal(found.t, stretch.t[1:5])
+    assert_array_equal(found.t, stretch.own.t[1:5])
     assert_array_equal(found.covariance[:3], whole.covariance[:3])
     assert np.isnan(found.covariance[3]).all()
     assert_array_equal(found.error[3], 0.0)
@@ -265,12 +265,12 @@ def test_a_cross_covariance_that_is_not_finite_breaks_the_window_that_ends_there
 def test_the_first_row_of_motions_is_only_where_they_start(rng):
     stretch = motion_stretch(drive(rng, "SE(3)", 12))
     whole = windows_of(stretch, Relative(4, "step", True))
-    stretch.estimate[0], stretch.covariance[0] = 7.0, np.nan
+    stretch.own.estimate[0], stretch.own.covariance[0] = 7.0, np.nan
     found = windows_of(stretch, Relative(4, "step", True))
     assert_array_equal(found.error, whole.error)
     assert_array_equal(found.covariance, whole.covariance)
-    stretch.covariance[1] = np.nan
-    assert windows_of(stretch, Relative(4, "step", True)).t.tolist() == [stretch.t[1]]
+    stretch.own.covariance[1] = np.nan
+    assert windows_of(stretch, Relative(4, "step", True)).t.tolist() == [stretch.own.t[1]]
 
 
 def test_poses_need_a_cross_covariance_of_the_very_next_row(rng):
@@ -278,7 +278,7 @@ def test_poses_need_a_cross_covariance_of_the_very_next_row(rng):
     with pytest.raises(cs.InputError, match=r"^row 2: --relative 2: the window spans 2 rows, .* reaches one row back"):
         windows_of(stretch, Relative(2, "step"))
     with pytest.raises(cs.InputError, match="poses: --relative: covariances of two poses do not tell"):
-        windows_of(replace(stretch, cross=None), NEXT)
+        windows_of(stretch.with_values(cross=None), NEXT)
 
 
 def test_runs_have_windows_by_their_times_where_those_are_known(rng):
@@ -286,10 +286,10 @@ def test_runs_have_windows_by_their_times_where_those_are_known(rng):
     first, second = (motion_stretch(drive(rng, "SE(2)", 12), run) for run in range(2))
     late = second.beside(np.arange(4, 13))
     record = recorded([first, late], "2", True)
-    assert_allclose(record.runs.t, first.t[[2, 4, 6, 8, 10, 12]])
+    assert_allclose(record.runs.t, first.own.t[[2, 4, 6, 8, 10, 12]])
     assert_array_equal(np.isnan(record.errors.error[:, :, 0]).sum(axis=1), [0, 2])
     assert np.isnan(record.errors.error[1, :2]).all()
-    timeless = [replace(each, numbered=True) for each in (first, late)]
+    timeless = [each.with_values(numbered=True) for each in (first, late)]
     record = recorded(timeless, "2", True)
     assert np.isnan(record.runs.t).all()
     assert np.isnan(record.errors.error[1, 4:]).all()
@@ -333,9 +333,10 @@ def test_the_rotation_of_a_window_is_that_of_its_widest_axis(rng):
     """A median over windows, of the greatest standard deviation about any axis."""
     for group, sigma in (("SE(2)", (9.0, 9.0, 0.12)), ("SE(3)", (9.0, 9.0, 9.0, 0.01, 0.12, 0.02))):
         stretch = motion_stretch(drive(rng, group, 30))
-        P = np.broadcast_to(np.diag(np.square(sigma)), stretch.covariance.shape)
+        P = np.broadcast_to(np.diag(np.square(sigma)), stretch.own.covariance.shape)
         large = [
-            replace(stretch, covariance=P * np.where(np.arange(31) < few, 100.0, 1.0)[:, None, None]) for few in (9, 25)
+            stretch.with_values(covariance=P * np.where(np.arange(31) < few, 100.0, 1.0)[:, None, None])
+            for few in (9, 25)
         ]
         near, far = (next(n for n in recorded([each], "1", True).origin.notes if "first order" in n) for each in large)
         assert "has a sigma of 0.12 rad in the median; beyond 0.1 a covariance" in near

@@ -23,7 +23,7 @@ from consistency.referee.readers.formats import file_kinds
 from consistency.referee.readers.formats.sheet import read_sheet, require_distinct
 from consistency.referee.readers.formats.text_blocks import Block, floats, read_numbers
 from consistency.referee.readers.mix_ups.reading_fit import fit_of
-from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.readers.truth_matching import make_poses
 from consistency.referee.show import as_md, figures
 from consistency.referee.show.figures import canvas
 from consistency.referee.system import stopping
@@ -336,7 +336,7 @@ def test_sound_poses_have_no_variance_that_counts_as_none():
     P = np.tile(np.diag([1e-25, 1e-23, 4.0]), (2, 1, 1))
     P[:, 0, 2] = P[:, 2, 0] = 1e-14
     t, pose = np.arange(2.0), np.zeros((2, 3))
-    poses = Poses(lambda _: "", t, pose, P, np.ones(2, bool), t, pose, "planar", "so2", 0.01)
+    poses = make_poses(lambda _: "", t, pose, P, np.ones(2, bool), t, pose, "planar", "so2", 0.01)
     assert poses.sound().variances.tolist() == [[0.0, 1e-23, 4.0]] * 2
-    assert poses.sound().covariance[0, 0, 2] == 1e-14
-    assert poses.covariance[0, 0, 0] == 1e-25
+    assert poses.sound().own.covariance[0, 0, 2] == 1e-14
+    assert poses.own.covariance[0, 0, 0] == 1e-25

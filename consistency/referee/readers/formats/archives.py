@@ -31,7 +31,16 @@ from consistency.referee.readers.mix_ups.hints import turns
 from consistency.referee.readers.options import GroupOptions, Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import Bounds, Estimator, Poses, at, manifold_of, unstated
+from consistency.referee.readers.truth_matching import (
+    Bounds,
+    Estimator,
+    Poses,
+    StatedError,
+    at,
+    make_poses,
+    manifold_of,
+    unstated,
+)
 from consistency.referee.types import Array, Failure, Indices
 
 OF_ERRORS, OF_POSES, OF_NEES = ("errors", "covariances"), ("estimates", "truth", "covariances"), ("nees", "dof")
@@ -92,7 +101,7 @@ def read_archive(path: Path, r: Reading, poses_alone: bool = False) -> list[Esti
     errors, definition = extended_errors(path, arrays, r.conventions.error)
     one = estimator_of_arrays(path, errors, r.with_error(None))
     assert isinstance(one, Estimator)
-    return [replace(one, convention=r.conventions.error or "", definition=definition)]
+    return [one.with_error(convention=r.conventions.error or "", definition=definition)]
 
 
 def first_known(repeats: Array) -> Array:
@@ -154,20 +163,20 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
     convention = declared or "vector"
     poses = []
     for one in _runs(archive, estimates, truth, there):
-        steps_of_run = (one.run, slice(len(one.t)))
+        steps_of_run = (one.source.run, slice(len(one.own.t)))
         rows = np.flatnonzero(there[steps_of_run])
-        place = one.place.at(rows).__getitem__
-        P = np.full((len(one.t), n, n), np.nan)
-        P[rows] = symmetric(covariances[one.run, rows], place)
+        place = one.own.place.at(rows).__getitem__
+        P = np.full((len(one.own.t), n, n), np.nan)
+        P[rows] = symmetric(covariances[one.source.run, rows], place)
         T = None
         if of_truth is not None:
-            T = symmetric(of_truth[one.run, rows], place)
+            T = symmetric(of_truth[one.source.run, rows], place)
         of_steps = {"nis": nis, "nis_dof": dof, "cross": cross, "by": by, "bounds": sizes}
         own: dict[str, Any] = {key: at(values, steps_of_run) for key, values in of_steps.items()}
         stated = np.ones(len(P), bool)
         manifold = manifold_of(convention)
         own |= {"covariance": P, "stated": stated, "true_covariance": T, "manifold": manifold, "convention": convention}
-        poses.append(replace(one, **own))
+        poses.append(one.with_values(**own))
     axes = archive.axes(n)
     gap = np.where(there[..., None], truth - estimates, np.nan)
     causes = swapped(path.stem, gap)
@@ -178,10 +187,8 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         causes += turns(path.stem, axes, gap, covariances, remedy)
     if r.runs.relative is not None:  # poses, or motions of them
         axes = PLANAR_POSE
-    definition = PLANAR.get(declared, "")
-    return Estimator(
-        path.stem, path, poses, axes, declared, definition, causes=causes, t=archive.times(steps), bounds=bounds
-    )
+    error = StatedError(axes, declared, PLANAR.get(declared, ""), bounds=bounds)
+    return Estimator(path.stem, path, poses, error, causes=causes, t=archive.times(steps))
 
 
 def _with_bounds(archive: Archive, r: Reading) -> tuple[Archive, Bounds | None, Array | None]:
@@ -254,9 +261,9 @@ def _of_members(archive: Archive, r: Reading) -> Estimator:
     by = archive.groups(r.groups, (runs, steps))
     poses = []
     for one in _runs(archive, means, _finite_truth(path, means, truth, there), there):
-        rows = one.run, slice(len(one.t))
-        poses.append(replace(one, manifold="vector", convention="vector", by=at(by, rows), members=members[rows]))
-    return of_members(Estimator(path.stem, path, poses, archive.axes(n), t=archive.times(steps)), r)
+        rows = one.source.run, slice(len(one.own.t))
+        poses.append(one.with_values(manifold="vector", convention="vector", by=at(by, rows), members=members[rows]))
+    return of_members(Estimator(path.stem, path, poses, StatedError(archive.axes(n)), t=archive.times(steps)), r)
 
 
 def _convention(archive: Archive, r: Reading, n: int) -> str:
@@ -298,7 +305,7 @@ def _poses_of_arrays(archive: Archive) -> Estimator:
         raise InputError(f"{path}: estimates {estimates.shape} and truth {truth.shape} must both be (runs, steps, 3)")
     there = archive.known(runs, steps) & np.isfinite(truth).all(axis=-1)
     poses = list(_runs(archive, estimates, truth, there))
-    return Estimator(path.stem, path, poses, PLANAR_POSE, t=archive.times(steps))
+    return Estimator(path.stem, path, poses, StatedError(PLANAR_POSE), t=archive.times(steps))
 
 
 def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Iterator[Poses]:
@@ -309,7 +316,7 @@ def _runs(archive: Archive, estimates: Array, truth: Array, there: Array) -> Ite
     for run, length in enumerate(archive.lengths(runs, steps)):
         t = np.arange(float(length))
         covariance, stated = unstated(length, n)
-        beside = Poses(
+        beside = make_poses(
             place=steps_of(path, run, np.arange(length)),
             t=t,
             estimate=estimates[run, :length],

@@ -304,10 +304,10 @@ def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
 
 def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:
     """The record with bounds in place of covariances; with ``--gaussian``, components by what they are stated with."""
-    stated = e.bounds
+    stated = e.error.bounds
     assert stated is not None
     if stated.gaussian:
-        places = {list(e.axes).index(axis): i for i, axis in enumerate(record.errors.axes)}
+        places = {list(e.error.axes).index(axis): i for i, axis in enumerate(record.errors.axes)}
         parts = tuple(tuple(places[i] for i in index) for index in stated.places)
         note = f"{e.said}: bounds are read as those of a Gaussian at --level {level_text}"
         errors = replace(record.errors, parts=parts if len(parts) > 1 else ())

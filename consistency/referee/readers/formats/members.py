@@ -48,12 +48,12 @@ def of_members(e: Estimator, r: Reading) -> Estimator:
         "ensemble": ", which is for their mean and covariance alone", "relative": "", "align": "", "axes": "",
         "truth_covariance": ": ranks have no covariance that it could be added to",
     })  # fmt: skip
-    first = e.runs[0].members
+    first = e.runs[0].own.members
     assert first is not None
     m, n = first.shape[1:]
     if m < 2:
         raise InputError(f"{e.path}: members: a rank beside 1 member does not show its size; give 2 or more, better 20")
-    axes = tuple(e.axes)
+    axes = tuple(e.error.axes)
     notes = [
         f"{e.said}: errors are normal numbers at the rank of the truth among {plural(m, 'member')}, random within it "
         f"(seed {SEED}); ratios are those of the covariance of Gaussian errors"
@@ -65,9 +65,9 @@ def of_members(e: Estimator, r: Reading) -> Estimator:
         notes.append(f"{e.said}: {m} members of {n} components say nothing of all components together; m > n would")
     runs = []
     for p in e.runs:
-        covariance = np.broadcast_to(np.eye(len(axes)), (len(p.t), len(axes), len(axes)))
-        runs.append(replace(p, covariance=covariance, stated=np.ones(len(p.t), bool)))
-    return replace(e, runs=runs, axes=axes, stated=ALONE, notes=(*e.notes, *notes))
+        covariance = np.broadcast_to(np.eye(len(axes)), (len(p.own.t), len(axes), len(axes)))
+        runs.append(p.with_values(covariance=covariance, stated=np.ones(len(p.own.t), bool)))
+    return replace(e, runs=runs).with_error(axes=axes, stated=ALONE).with_notes(*notes)
 
 
 # --- tables ------------------------------------------------------------------------------------------

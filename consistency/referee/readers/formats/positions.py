@@ -18,7 +18,7 @@ from consistency.referee.readers.alignment import skew
 from consistency.referee.readers.formats.text_blocks import LineParser, Lines, increasing, parsed
 from consistency.referee.readers.options import Reading, flag_of
 from consistency.referee.readers.runs_to_record import symmetric
-from consistency.referee.readers.truth_matching import AXES, Poses, finite_rows
+from consistency.referee.readers.truth_matching import AXES, Poses, finite_rows, make_poses
 from consistency.referee.types import Array
 
 SAME = 1e-9  # of quaternions
@@ -61,7 +61,7 @@ def require_positions(path: Path, poses: Sequence[Poses], r: Reading) -> None:
     InputError
         Some runs have a truth with orientations, or an option needs one.
     """
-    alone = f"{poses[0].files[1]} holds positions alone"
+    alone = f"{poses[0].source.files[1]} holds positions alone"
     if any(one.manifold != "vector" for one in poses):
         raise InputError(f"{path}: the truth of some runs has orientations, of others none; judge them apart")
     if r.runs.relative is not None:
@@ -99,20 +99,19 @@ def point_positions(poses: Poses, lever: Sequence[float] | None, blocks: bool) -
     if blocks and (arm.any() or poses.convention == "right"):
         option = "--lever-arm" if arm.any() else "--error right"
         what = "moves errors of the rotation into that of the position, whose cross terms are not stated"
-        raise InputError(f"{poses.place[0]}: {option} {what}; give covariances of whole poses")
-    T = np.full((len(poses.t), 4, 4), np.nan)
-    finite = finite_rows(poses.estimate)
-    T[finite] = matrices(poses.estimate[finite, :7])
-    point = poses.estimate[:, :3] + T[:, :3, :3] @ arm
-    of_truth = poses.true_covariance
+        raise InputError(f"{poses.own.place[0]}: {option} {what}; give covariances of whole poses")
+    T = np.full((len(poses.own.t), 4, 4), np.nan)
+    finite = finite_rows(poses.own.estimate)
+    T[finite] = matrices(poses.own.estimate[finite, :7])
+    point = poses.own.estimate[:, :3] + T[:, :3, :3] @ arm
+    of_truth = poses.true.covariance
     if of_truth is not None:
         of_truth = of_truth[:, :3, :3]
     J = _jacobian(poses.convention, T, arm)
-    return replace(
-        poses,
+    return poses.with_values(
         estimate=point,
-        covariance=propagated(J, poses.covariance),
-        truth=poses.truth[:, :3],
+        covariance=propagated(J, poses.own.covariance),
+        truth=poses.true.values[:, :3],
         manifold="vector",
         convention="vector",
         cross=None,
@@ -130,7 +129,7 @@ def placeholder(poses: Sequence[Poses]) -> tuple[bool, str]:
     ----------
     poses : runs in space
     """
-    quaternions = np.concatenate([one.truth[:, 3:7] for one in poses])
+    quaternions = np.concatenate([one.true.values[:, 3:7] for one in poses])
     if (np.abs(np.abs(quaternions @ quaternions[0]) - 1.0) > SAME).any():
         return False, ""
     turns = [turn for one in poses if (turn := _turning(one)) is not None]
@@ -158,13 +157,13 @@ def _turning(one: Poses) -> tuple[float, float, float] | None:
     too few rows have a truth.
     """
     known = one.known()
-    finite = finite_rows(one.estimate[known.rows])
+    finite = finite_rows(one.own.estimate[known.rows])
     rows = known.rows[finite]
     true = known.truth[finite, :3]
     if len(rows) < FEWEST:
         return None
-    R = Rotation.from_quat(one.estimate[rows, 3:7])
-    variance = np.trace(one.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)
+    R = Rotation.from_quat(one.own.estimate[rows, 3:7])
+    variance = np.trace(one.own.covariance[rows, 3:6, 3:6], axis1=1, axis2=2)
     sigma = np.sqrt(np.abs(variance))
     turned = (R[0].inv() * R).magnitude()
     turn = float(np.max(np.where(turned > BEYOND * sigma, turned, 0.0)))
@@ -196,7 +195,7 @@ def fixed(own: Fixes, true: Lines, r: Reading, of_truth: Array | None = None) ->
     if of_truth is not None:
         of_truth = of_truth[:, :3, :3]
     P = symmetric(own.covariances, own.place)
-    return Poses(
+    return make_poses(
         place=own.places,
         t=own.t,
         estimate=own.values[:, 1:4],

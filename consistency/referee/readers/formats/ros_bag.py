@@ -71,12 +71,12 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     why = "; as the ROS messages define it; declare yours with --error"
     mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
     found = space_estimator(path, (_run_of(bag, r) for bag in counted(bags, *READING)), r, why, mixed)
-    if r.statement.unstated and not any(one.covariance.any() for one in found.runs):
+    if r.statement.unstated and not any(one.own.covariance.any() for one in found.runs):
         return [found]
     judged, note = _stated(path, found.runs)
     if r.components.axes is not None or not note:
         return [found]
-    return [replace(found, judged=judged, notes=(*found.notes, note))]
+    return [found.with_error(judged=judged).with_notes(note)]
 
 
 def _require_whole(path: Path, bags: Sequence[Path]) -> None:

@@ -26,7 +26,9 @@ from consistency.referee.readers.truth_matching import (
     Estimator,
     Poses,
     Stated,
+    StatedError,
     finite_rows,
+    make_poses,
     manifold_of,
     unstated,
 )
@@ -249,7 +251,7 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
     state = np.column_stack([nothing, *map(sheet.numbers, sheet.among(axes))])
     nis, dof = columns.nis_columns(sheet)
     covariance, stated = unstated(len(sheet), 1)
-    poses = Poses(
+    poses = make_poses(
         place=sheet.places,
         t=t,
         estimate=state,
@@ -265,7 +267,7 @@ def _innovations(name: str, sheet: TableRows, key: str, axes: Sequence[str]) -> 
         nis=nis,
         nis_dof=dof,
     )
-    return Estimator(name, sheet.path, _by_run(sheet, runs, poses), axes, innovations_alone=True)
+    return Estimator(name, sheet.path, _by_run(sheet, runs, poses), StatedError(axes), innovations_alone=True)
 
 
 def _estimator(
@@ -305,7 +307,7 @@ def _estimator(
     estimate[~finite_rows(estimate)] = np.nan
     nis, dof = columns.nis_columns(sheet)
     by_step = key == "step"
-    poses = Poses(
+    poses = make_poses(
         place=sheet.places,
         t=sheet.numbers(key, finite=True),
         estimate=estimate,
@@ -330,13 +332,13 @@ def _estimator(
     if r.components.members is not None:
         from consistency.referee.readers.formats.members import member_columns
 
-        poses = replace(poses, members=member_columns(sheet, r.components.members))
+        poses = poses.with_values(members=member_columns(sheet, r.components.members))
     of_runs = _by_run(sheet, runs, poses)
     if "run" in truth:
-        of_runs = [one.beside(np.flatnonzero(true_runs == one.run)) for one in of_runs]
+        of_runs = [one.beside(np.flatnonzero(true_runs == one.source.run)) for one in of_runs]
     for one in of_runs:
-        if not len(one.true_t):
-            has = f"holds no run {one.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
+        if not len(one.true.t):
+            has = f"holds no run {one.source.run} (it has {', '.join(map(str, np.unique(true_runs)[:5]))})"
             raise InputError(f"{truth.path}: {has}; without a column 'run' it serves all")
     definition = PLANAR[convention]
     if convention == "vector" and r.conventions.error is None and r.components.members is None:
@@ -344,10 +346,8 @@ def _estimator(
         if on_one_turn:
             definition = f"plain difference; {on_one_turn}"
     judged = None if bounds is None else sorted(set(sum(bounds.places, ())))
-    found = Estimator(
-        name, sheet.path, of_runs, axes, convention, definition, stated, notes=notes, judged=judged,
-        position=_position(axes), bounds=bounds,
-    )  # fmt: skip
+    error = StatedError(axes, convention, definition, stated, judged=judged, position=_position(axes), bounds=bounds)
+    found = Estimator(name, sheet.path, of_runs, error, notes=notes)
     if r.components.members is None:
         return found
     from consistency.referee.readers.formats.members import of_members
@@ -365,7 +365,7 @@ def _by_run(sheet: TableRows, runs: Array, poses: Poses) -> list[Poses]:
             name = f"run {run}"
         one = poses.of_rows(rows)
         open_end = sheet.open_end(int(rows[-1]))
-        found.append(replace(one, run=int(run), name=name, open_end=open_end))
+        found.append(one.with_values(run=int(run), name=name, open_end=open_end))
     return found
 
 

@@ -276,17 +276,21 @@ def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Pose
     turn of these, and in degrees otherwise; values beyond 360 are taken to count turns and stay.
     """
     angles = [i for i, axis in enumerate(axes) if ANGLES & set(axis.lower().split("_"))]
-    found = [replace(p, estimate=p.estimate.copy(), truth=p.truth.copy()) for p in runs] if angles else list(runs)
+    found = list(runs)
+    if angles:
+        found = [p.with_values(estimate=p.own.estimate.copy(), truth=p.true.values.copy()) for p in runs]
     changed = []
     for i in angles:
-        size = max(np.nanmax(np.abs(values[:, i]), initial=0.0) for p in runs for values in (p.estimate, p.truth))
+        size = max(
+            np.nanmax(np.abs(values[:, i]), initial=0.0) for p in runs for values in (p.own.estimate, p.true.values)
+        )
         turn = 2.0 * np.pi if size <= 2.0 * np.pi + 1e-6 else 360.0
         rows = 0
         for p in found if size <= 360.0 else ():
             rows += int((np.abs(_apart(p, i)) > LEAST_APART * turn).sum())
-            p.truth[:, i] = np.unwrap(p.truth[:, i], period=turn)
+            p.true.values[:, i] = np.unwrap(p.true.values[:, i], period=turn)
             apart = _apart(p, i)
-            p.estimate[:, i] += turn * np.where(np.abs(apart) > LEAST_APART * turn, np.round(apart / turn), 0.0)
+            p.own.estimate[:, i] += turn * np.where(np.abs(apart) > LEAST_APART * turn, np.round(apart / turn), 0.0)
         if rows:
             changed.append(f"{axes[i]} ({plural(rows, 'row')})")
     if not changed:
@@ -297,7 +301,7 @@ def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Pose
 
 def _apart(p: Poses, i: int) -> Array:
     """Truth less estimate of one component, (N,), the truth interpolated."""
-    return np.asarray(np.interp(p.t, p.true_t, p.truth[:, i]) - p.estimate[:, i])
+    return np.asarray(np.interp(p.own.t, p.true.t, p.true.values[:, i]) - p.own.estimate[:, i])
 
 
 # --- covariances and innovations ------------------------------------------------------------------------

@@ -54,7 +54,9 @@ from consistency.referee.readers.truth_matching import (
     Files,
     Poses,
     Stated,
+    StatedError,
     finite_rows,
+    make_poses,
     unstated,
 )
 from consistency.referee.system.progress import counted
@@ -130,7 +132,7 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
             raise InputError(mixed or what)
         one, unjudged = _beside_truth(replace(run, own=own, true=true), layout, r)
         notes.append(unjudged)
-        poses.append(replace(one, run=len(poses), files=run.files, open_end=own.open_end()))
+        poses.append(one.with_values(run=len(poses), files=run.files, open_end=own.open_end()))
     assert layout is not None
     if poses[0].manifold == "spatial" and r.components.axes is None and r.runs.relative is None:
         is_empty, what = placeholder(poses)
@@ -151,21 +153,10 @@ def space_estimator(path: Path, runs: Iterable[SpaceRun], r: Reading, why: str =
     elif not why:
         why = f"; the default of this layout, {_origin(layout.stated)}"
     definition = f"{INERTIAL.get(kind) or PLANAR[kind]}{why}"
-    axes = STATE[: poses[0].covariance.shape[-1]]
-    return Estimator(
-        path.stem,
-        path,
-        poses,
-        axes,
-        kind,
-        definition,
-        layout.stated,
-        label=path.name,
-        covariances=r.sources.covariance,
-        notes=one_of_each_kind(notes),
-        in_space=True,
-        position=3,
-    )
+    axes = STATE[: poses[0].own.covariance.shape[-1]]
+    error = StatedError(axes, kind, definition, layout.stated, in_space=True, position=3)
+    kept = one_of_each_kind(notes)
+    return Estimator(path.stem, path, poses, error, label=path.name, covariances=r.sources.covariance, notes=kept)
 
 
 def _layout_of(own: Lines, files: Files, r: Reading) -> Layout:
@@ -224,7 +215,7 @@ def poses_without_covariances(path: Path, runs: Iterable[SpaceRun], r: Reading) 
                 raise InputError(f"{name}: holds positions alone; motions need orientations, too")
         covariance, stated = unstated(len(run.own.t), 6)
         poses.append(_poses(run, 0, covariance, stated, "left", r))
-    return Estimator(path.stem, path, poses, STATE[:6], in_space=True)
+    return Estimator(path.stem, path, poses, StatedError(STATE[:6], in_space=True))
 
 
 # --- a run with its truth ----------------------------------------------------------------------------
@@ -236,7 +227,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     true = run.true
     by = _own_column(own, r.groups)
     if isinstance(own, Fixes):
-        return replace(fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)), by=by), ""
+        return fixed(own, true, r, _of_truth(true, own, ORDERS[0], r)).with_values(by=by), ""
     k, note = judged_rest(own, true, r)
     order = r.conventions.covariance_order or ORDERS[0]
     P, known = unstated(len(own.t), 6 + k)
@@ -246,7 +237,7 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
     of_truth = _of_truth(true, own, order, r)
     run = replace(run, own=own.of(slice(0, POSE_NUMBERS)))  # without the covariances, of which P has a copy
     poses = _poses(run, k, P, known, layout.convention, r)
-    poses = replace(poses, cross=cross, true_covariance=of_truth, by=by)
+    poses = poses.with_values(cross=cross, true_covariance=of_truth, by=by)
     if _is_point(true):
         poses = point_positions(poses, r.matching.lever_arm, layout.stated != WHOLE)
     return poses, note
@@ -267,7 +258,7 @@ def _poses(run: SpaceRun, k: int, covariance: Array, stated: Array, convention: 
     """Poses beside the true ones, both with the first ``k`` numbers of velocity and biases behind them."""
     own = run.own
     true = run.true
-    return Poses(
+    return make_poses(
         place=own.places,
         t=own.t,
         estimate=_states(own, k),

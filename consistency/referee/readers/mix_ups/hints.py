@@ -99,8 +99,9 @@ def _errors_without(runs: Sequence[Poses], errors: Sequence[Array], change: Chan
     pairs = []
     for p, error in zip(runs, errors, strict=True):
         other = change(p)
-        same = other.estimate is p.estimate and other.truth is p.truth and other.convention == p.convention
-        pairs.append((error if same else other.errors(), other.covariance))
+        is_moved = other.own.estimate is not p.own.estimate or other.true.values is not p.true.values
+        same = not is_moved and other.convention == p.convention
+        pairs.append((error if same else other.errors(), other.own.covariance))
     return pairs
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -64,7 +64,7 @@ def guesses_of(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> l
     """Possible mix-ups of covariances, units and orders, the likelier first; ``part`` is judged."""
     kind = runs[0].manifold
     convention = runs[0].convention
-    n = runs[0].covariance.shape[-1]
+    n = runs[0].own.covariance.shape[-1]
     if kind == "spatial" and n > 6:
         return list(_swapped_blocks(n))
     scales = [*_roots(runs, part), *_singular(runs, axes, part)]
@@ -95,7 +95,7 @@ def changed(**functions: Function) -> Change:
     """A change of some fields of poses, each by a function of what it holds."""
 
     def change(p: Poses) -> Poses:
-        return replace(p, **{name: function(getattr(p, name)) for name, function in functions.items()})
+        return p.with_values(**{name: function(p.value(name)) for name, function in functions.items()})
 
     return change
 
@@ -159,7 +159,7 @@ def _roots(runs: Sequence[Poses], part: list[int]) -> Iterator[Guess]:
 
 def _cross_terms(runs: Sequence[Poses], part: list[int]) -> Array:
     """Numbers beside the diagonals of the rows and columns ``part``, those that are finite, (k,)."""
-    P = np.concatenate([submatrices(p.covariance, part) for p in runs])
+    P = np.concatenate([submatrices(p.own.covariance, part) for p in runs])
     values = P[:, ~np.eye(len(part), dtype=bool)]
     return np.asarray(values[np.isfinite(values)])
 
@@ -216,7 +216,7 @@ def _swapped_blocks(n: int) -> Iterator[Guess]:
 
 def _singular(runs: Sequence[Poses], axes: Sequence[str], part: list[int]) -> Iterator[Guess]:
     """Cross terms that make the covariance nearly singular, while each component by itself is right."""
-    P = submatrices(np.concatenate([p.covariance for p in runs]), part)
+    P = submatrices(np.concatenate([p.own.covariance for p in runs]), part)
     P = P[finite_rows(P)]
     if len(part) < 2 or not len(P):
         return
@@ -250,7 +250,7 @@ def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[G
     """Four components of a state that are a unit quaternion, which has three degrees of freedom."""
     for first in range(len(axes) - 3):
         four = slice(first, first + 4)
-        states = [values for p in runs for values in (p.estimate, p.truth)]
+        states = [values for p in runs for values in (p.own.estimate, p.true.values)]
         values = np.concatenate(states)[:, four]
         values = values[finite_rows(values)]
         lengths = np.linalg.norm(values, axis=1)
@@ -268,12 +268,12 @@ def _quaternion_states(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[G
 def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
     """The state with a rotation vector, of the truth beside the estimate, in place of the quaternion."""
     order = np.arange(first, first + 4)
-    rest = np.delete(np.arange(p.estimate.shape[1]), order)
+    rest = np.delete(np.arange(p.own.estimate.shape[1]), order)
     if w == 0:
         order = np.roll(order, -1)
     p = p.matched()
-    turn = Rotation.from_quat(p.estimate[:, order])
-    true = Rotation.from_quat(p.truth[:, order])
+    turn = Rotation.from_quat(p.own.estimate[:, order])
+    true = Rotation.from_quat(p.true.values[:, order])
     small = (turn.inv() * true).as_rotvec()
     x, y, z, s = turn.as_quat().T
     G = 2.0 * np.array([
@@ -281,13 +281,13 @@ def _rotation_vectors(p: Poses, first: int, w: int) -> Poses:
         [-z, s, x, -y],
         [y, -x, s, -z],
     ])  # fmt: skip
-    J = np.zeros((len(turn), len(rest) + 3, p.estimate.shape[1]))
+    J = np.zeros((len(turn), len(rest) + 3, p.own.estimate.shape[1]))
     J[:, range(len(rest)), rest] = 1.0
     J[:, len(rest) :, order] = np.moveaxis(G, -1, 0)
-    P = J @ p.covariance @ np.swapaxes(J, 1, 2)
-    truth = np.hstack([p.truth[:, rest], small])
-    estimate = np.hstack([p.estimate[:, rest], np.zeros_like(small)])
-    return replace(p, estimate=estimate, covariance=P, truth=truth)
+    P = J @ p.own.covariance @ np.swapaxes(J, 1, 2)
+    truth = np.hstack([p.true.values[:, rest], small])
+    estimate = np.hstack([p.own.estimate[:, rest], np.zeros_like(small)])
+    return p.with_values(estimate=estimate, covariance=P, truth=truth)
 
 
 def _permuted(axes: Sequence[str], width: int, states: bool = False) -> Iterator[Guess]:
@@ -424,7 +424,7 @@ def worlds_of(runs: Sequence[Poses]) -> list[Guess]:
     """Possible mix-ups of the worlds and bodies of poses, the likelier first; none of other states."""
     kind = runs[0].manifold
     convention = runs[0].convention
-    if kind == "vector" or runs[0].covariance.shape[-1] > 6:
+    if kind == "vector" or runs[0].own.covariance.shape[-1] > 6:
         return []
     axes = _ned() if kind == "spatial" else [_mirrored(convention)]
     return [*axes, *_frames(runs), *_bodies(runs)]
@@ -514,7 +514,7 @@ def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
     blocks = _position_blocks(runs[0], [axis.lower() for axis in axes])
     if not blocks or runs[0].convention not in IN_WORLD:
         return
-    if not any(np.ptp(p.estimate[:, blocks[0]], axis=0).any() for p in runs if len(p.t)):
+    if not any(np.ptp(p.own.estimate[:, blocks[0]], axis=0).any() for p in runs if len(p.own.t)):
         return  # errors without places
     names = ", ".join(axes[i] for i in blocks[0])
     own = f"turn it into the axes of {names}"
@@ -532,7 +532,7 @@ def turns_of(runs: Sequence[Poses], axes: Sequence[str]) -> Iterator[Guess]:
 def _position_blocks(p: Poses, axes: Sequence[str]) -> list[list[int]]:
     """Places of the positions, and of velocities along the same axes; none where the state has no positions."""
     if p.manifold != "vector":
-        poses_alone = p.covariance.shape[-1] <= 6
+        poses_alone = p.own.covariance.shape[-1] <= 6
         return [list(range(p.d))] if poses_alone else []
     for names in map(str.split, NAMES):
         for d in (3, 2):
@@ -547,12 +547,12 @@ def _turned(words: str, axes: Axes, blocks: list[list[int]]) -> Guess:
     """Covariances in axes of their own, turned into those of the error."""
 
     def change(p: Poses) -> Poses:
-        n = p.covariance.shape[-1]
+        n = p.own.covariance.shape[-1]
         own = axes(p, blocks[0])
         T = np.tile(np.eye(n), (len(own), 1, 1))
         for block in blocks:
             T[np.ix_(range(len(own)), block, block)] = own
-        return replace(p, covariance=T @ p.covariance @ np.swapaxes(T, 1, 2))
+        return p.with_values(covariance=T @ p.own.covariance @ np.swapaxes(T, 1, 2))
 
     return Guess(words, change)
 
@@ -562,10 +562,10 @@ def _motion(p: Poses, places: list[int]) -> tuple[Array, Array]:
 
     Where nothing moves, the motion is that before.
     """
-    last = len(p.true_t) - 1
-    before = np.clip(np.searchsorted(p.true_t, p.t, side="right") - 1, 0, last)
-    at = nearest(p.t, p.true_t, before)
-    true = p.truth[:, places]
+    last = len(p.true.t) - 1
+    before = np.clip(np.searchsorted(p.true.t, p.own.t, side="right") - 1, 0, last)
+    at = nearest(p.own.t, p.true.t, before)
+    true = p.true.values[:, places]
     change = true[np.minimum(at + 1, last)] - true[np.maximum(at - 1, 0)]
     moves = (change != 0).any(axis=1)
     latest = np.maximum.accumulate(np.where(moves, np.arange(len(at)), 0))
@@ -583,7 +583,7 @@ def _wrong_way(p: Poses, places: list[int]) -> Array:
     if p.manifold == "vector":
         _, change = _motion(p, places)
         return _about_z(2.0 * np.arctan2(change[:, 1], change[:, 0]), len(places))
-    forward = rotations(p.estimate, p.manifold).apply([1.0, 0.0, 0.0])
+    forward = rotations(p.own.estimate, p.manifold).apply([1.0, 0.0, 0.0])
     return _about_z(2.0 * np.arctan2(forward[:, 1], forward[:, 0]), len(places))
 
 

@@ -365,14 +365,14 @@ def is_plausible(runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> 
         return False
     pairs = []
     for p in some:
-        pairs.append((p.errors()[:, judged], submatrices(p.covariance, judged)))
+        pairs.append((p.errors()[:, judged], submatrices(p.own.covariance, judged)))
     declared = fit_of(pairs)
     return declared is not None and not declared.is_off()
 
 
 def thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
     """Some estimates of some runs, without those that are not finite."""
-    most = max(MOST_NUMBERS // runs[0].covariance.shape[-1] ** 2, 1)
+    most = max(MOST_NUMBERS // runs[0].own.covariance.shape[-1] ** 2, 1)
     runs = runs[:: math.ceil(len(runs) / min(MOST_RUNS, most))]
     share = most // len(runs)
     each = max(min(MOST, most) // len(runs), min(LEAST_EACH, share))
@@ -383,7 +383,7 @@ def is_same(runs: Sequence[Poses]) -> bool:
     """Whether the errors are rounding in nearly all estimates, in values and beside their standard deviations."""
     same = total = 0
     for p in runs:
-        largest = float(np.abs(p.truth).max(initial=0.0))
+        largest = float(np.abs(p.true.values).max(initial=0.0))
         rounding = ROUNDING * max(1.0, largest)
         p = p.matched()
         error = np.abs(p.errors())

@@ -44,19 +44,19 @@ def with_values(e: Estimator, options: GroupOptions, judged: Sequence[int]) -> t
     assert options.by is not None
     if e.innovations_alone:
         raise InputError(f"--by {options.by}: {e.path} {NO_TRUTH}")
-    cells = [p.by for p in e.runs if p.by is not None]
+    cells = [p.own.by for p in e.runs if p.own.by is not None]
     if options.by_file is not None:
         sheet = _sheet(options)
-        cells = [_looked_up(sheet, options.by, p.run, p.seconds) for p in e.runs]
+        cells = [_looked_up(sheet, options.by, p.source.run, p.seconds) for p in e.runs]
     if len(cells) < len(e.runs):
         raise InputError(f"--by {options.by}: {e.path} {NO_COLUMNS}")
     column = column_of(options.by, np.concatenate(cells))
-    column = replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged]))
+    column = replace(column, outcome=selects_on_outcome(column, [e.error.axes[i] for i in judged]))
     runs = []
     start = 0
     for p in e.runs:
-        end = start + len(p.t)
-        runs.append(replace(p, by=column.values[start:end]))
+        end = start + len(p.own.t)
+        runs.append(p.with_values(by=column.values[start:end]))
         start = end
     return replace(e, runs=runs), column
 
@@ -77,7 +77,7 @@ def in_groups(
     """
     if pairs:
         axes = itertools.chain.from_iterable(record.errors.axes for record in records)
-        column = _beside_states(column, e, sorted(map(list(e.axes).index, axes)), pairs)
+        column = _beside_states(column, e, sorted(map(list(e.error.axes).index, axes)), pairs)
     return [grouped(record, column, options) for record in records]
 
 
@@ -89,23 +89,23 @@ def _beside_states(column: Column, e: Estimator, judged: Sequence[int], pairs: S
     estimate = []
     P = []
     for p in pairs:
-        some = p.pairs(_some(len(p.t), len(pairs)))
-        assert some.by is not None
-        values.append(some.by)
-        truth.append(some.truth[:, columns[columns < some.truth.shape[1]]])
-        estimate.append(some.estimate[:, columns[columns < some.estimate.shape[1]]])
-        P.append(submatrices(some.covariance, judged))
+        some = p.pairs(_some(len(p.own.t), len(pairs)))
+        assert some.own.by is not None
+        values.append(some.own.by)
+        truth.append(some.true.values[:, columns[columns < some.true.values.shape[1]]])
+        estimate.append(some.own.estimate[:, columns[columns < some.own.estimate.shape[1]]])
+        P.append(submatrices(some.own.covariance, judged))
     column = replace(column, values=np.concatenate(values))
     stacked = map(np.concatenate, (truth, estimate, P))
-    return replace(column, outcome=selects_on_outcome(column, [e.axes[i] for i in judged], *stacked))
+    return replace(column, outcome=selects_on_outcome(column, [e.error.axes[i] for i in judged], *stacked))
 
 
 def _columns_of(e: Estimator, judged: Sequence[int]) -> Indices:
     """Columns of a state that are judged components; of rotations in space, which are quaternions, none."""
     columns = np.array(judged, np.int64)
-    if not e.convention:  # errors of an archive stand in the place of a truth
+    if not e.error.convention:  # errors of an archive stand in the place of a truth
         return columns[:0]
-    if e.in_space:
+    if e.error.in_space:
         columns = np.concatenate([columns[columns < 3], columns[columns > 5] + 1])
     return columns
 

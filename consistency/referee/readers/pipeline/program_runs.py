@@ -31,7 +31,14 @@ from consistency.referee.readers.formats.table_columns import has_nis
 from consistency.referee.readers.options import Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import CutNote, Places, listed
-from consistency.referee.readers.truth_matching import OF_ESTIMATES, OF_TRUTH, Estimator, Poses, Stated
+from consistency.referee.readers.truth_matching import (
+    PLACES,
+    Estimator,
+    Poses,
+    Stated,
+    StatedError,
+    make_poses,
+)
 from consistency.referee.system.folders import read_manifest
 
 RUN_KIND = "run of a program"  # of run.json: a program may write a file of that name itself
@@ -43,10 +50,12 @@ Reader = Callable[[Path, Reading], Sequence[Estimator | Record]]
 LATE = 1.5  # steps of the estimates: the truth may go on by less than two
 
 NUMBERS = "numbers.npz"  # in the folder of a run
-OF_POSES = tuple(name for name in (*OF_ESTIMATES, *OF_TRUTH) if name != "by")  # whose cells may be words
+NO_NUMBERS = ("place", "by")  # of poses: the cells of a column may be words
+OF_POSES = [name for name, (part, _) in PLACES.items() if part in ("own", "true") and name not in NO_NUMBERS]
 TEXTS_OF_POSES = ("manifold", "convention", "max_dt", "run", "name", "numbered", "open_end")
 TEXTS = ("name", "axes", "convention", "definition", "label", "notes", "causes", "judged", "in_space", "position",
          "innovations_alone")  # fmt: skip
+OF_ERROR = ("axes", "convention", "definition", "judged", "in_space", "position")  # of these texts
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
@@ -307,7 +316,7 @@ class ProgramRuns:
         if r.sources.truth is None or self.options.sources.truth is not None:
             return found
         note = f"{r.sources.truth}: taken as the truth of the run, as no column of {estimates.name} is one; see --truth"
-        return [replace(one, notes=(*one.notes, note)) for one in found]
+        return [one.with_notes(note) for one in found]
 
     @property
     def first(self) -> int:
@@ -408,19 +417,19 @@ def _require_whole(records: Sequence[Record]) -> None:
 
 def _end_of(p: Poses) -> tuple[float, str]:
     """Time or step of the last estimate, and what to say where the truth continues."""
-    if len(p.t) < 2 or not len(p.true_t):
-        return float(p.t[-1]), ""
-    period = float(np.median(np.diff(p.t)))
+    if len(p.own.t) < 2 or not len(p.true.t):
+        return float(p.own.t[-1]), ""
+    period = float(np.median(np.diff(p.own.t)))
     late = ""
-    if p.true_t[-1] - p.t[-1] > LATE * period:
-        late = f"its estimates end at {p.t[-1]:.6g}, its truth at {p.true_t[-1]:.6g}"
-    return float(p.t[-1]), late
+    if p.true.t[-1] - p.own.t[-1] > LATE * period:
+        late = f"its estimates end at {p.own.t[-1]:.6g}, its truth at {p.true.t[-1]:.6g}"
+    return float(p.own.t[-1]), late
 
 
 def _digest(found: Sequence[Estimator]) -> str:
     """Digest of the truth of a run."""
     p = found[0].runs[0]
-    numbers = np.concatenate([p.true_t, p.truth.ravel()])
+    numbers = np.concatenate([p.true.t, p.true.values.ravel()])
     return hashlib.sha256(numbers.tobytes()).hexdigest()[:16]
 
 
@@ -485,9 +494,9 @@ def _one_estimator(
     first = next(iter(own.values()))
     poses: list[Poses] = []
     for run, one in own.items():
-        if (one.axes, one.stated, one.convention) != (first.axes, first.stated, first.convention):
+        if _kind_of(one.error) != _kind_of(first.error):
             raise InputError(f"{one.path}: has another state or kind of covariance than {first.path}")
-        poses.append(replace(one.runs[0], run=run))
+        poses.append(one.runs[0].with_values(run=run))
     without = dict.fromkeys(set(all_runs).difference(own), f"it holds no estimates of '{name}'")
     t = first.t
     notes: dict[str, str] = {}
@@ -509,9 +518,14 @@ def _one_estimator(
     )
 
 
+def _kind_of(error: StatedError) -> tuple[Sequence[str], Stated, str]:
+    """What the errors of all runs of an estimator have in common."""
+    return error.axes, error.stated, error.convention
+
+
 def _without_paths(note: str, one: Estimator) -> str:
     """A note as the files of every run would have it."""
-    for path in (one.path, *one.runs[0].files):
+    for path in (one.path, *one.runs[0].source.files):
         note = note.replace(str(path), "")
     return note
 
@@ -526,19 +540,19 @@ def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:
     for i, one in enumerate(estimators):
         p = one.runs[0]
         for key in OF_POSES:
-            arrays[f"{i} {key}"] = getattr(p, key)
+            arrays[f"{i} {key}"] = p.value(key)
         arrays[f"{i} times"] = one.t
         texts: dict[str, Any] = {
             "path": str(one.path),
-            "files": list(map(str, p.files)),
-            "alone": one.stated.alone,
-            "groups": {name: [group.start, group.stop] for name, group in one.stated.groups.items()},
-            "beside": p.true_t is p.t,
+            "files": list(map(str, p.source.files)),
+            "alone": one.error.stated.alone,
+            "groups": {name: [group.start, group.stop] for name, group in one.error.stated.groups.items()},
+            "beside": p.true.t is p.own.t,
         }
         for key in TEXTS:
-            texts[key] = getattr(one, key)
+            texts[key] = getattr(one.error if key in OF_ERROR else one, key)
         for key in TEXTS_OF_POSES:
-            texts[f"poses {key}"] = getattr(p, key)
+            texts[f"poses {key}"] = p.value(key)
         about.append(texts)
     there = {key: array for key, array in arrays.items() if array is not None}
     partial = folder / f"{NUMBERS}.partial"
@@ -571,9 +585,10 @@ def _estimator(i: int, texts: dict[str, Any], arrays: dict[str, Any]) -> Estimat
     path = Path(texts["path"])
     estimates, truth = map(Path, texts["files"])
     place = Places(lambda row: f"{path}, row {row + 1}", np.arange(len(own["t"])))
-    poses = Poses(place=place, files=(estimates, truth), **own)
+    poses = make_poses(place=place, files=(estimates, truth), **own)
     groups = {name: slice(*ends) for name, ends in texts["groups"].items()}
-    of_estimator = {key: texts[key] for key in TEXTS}
-    of_estimator["axes"] = tuple(texts["axes"])
-    stated = Stated(groups, texts["alone"])
-    return Estimator(path=path, runs=[poses], stated=stated, t=arrays.get(f"{i} times"), **of_estimator)
+    of_estimator = {key: texts[key] for key in TEXTS if key not in OF_ERROR}
+    of_error = {key: texts[key] for key in OF_ERROR}
+    of_error["axes"] = tuple(texts["axes"])
+    error = StatedError(stated=Stated(groups, texts["alone"]), **of_error)
+    return Estimator(path=path, runs=[poses], error=error, t=arrays.get(f"{i} times"), **of_estimator)

@@ -78,7 +78,7 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
 
 def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record]:
     """The records with bounds in place of covariances, where bounds are stated."""
-    if e.bounds is None:
+    if e.error.bounds is None:
         return records
     from consistency.referee.readers.formats.bounds import judged_bounds
 
@@ -90,16 +90,16 @@ def with_unit_covariances(e: Estimator) -> Estimator:
 
     Zeros state none, and neither does one multiple of I in every row of poses, whose units differ.
     """
-    first = next((p.covariance[p.stated][0] for p in e.runs if p.stated.any()), np.zeros((1, 1)))
+    first = next((p.own.covariance[p.own.stated][0] for p in e.runs if p.own.stated.any()), np.zeros((1, 1)))
     placeholder = first[0, 0] * np.eye(len(first)) if e.runs[0].manifold != "vector" else np.zeros((1, 1))
-    if not all((p.covariance[p.stated] == placeholder).all() for p in e.runs):  # NaN is stated, too: a failure
+    if not all((p.own.covariance[p.own.stated] == placeholder).all() for p in e.runs):  # NaN is stated, too: a failure
         return e
     runs = []
     for p in e.runs:
-        unit = np.broadcast_to(np.eye(p.covariance.shape[-1]), p.covariance.shape)
-        runs.append(replace(p, covariance=unit, stated=np.ones(len(p.t), bool)))
+        unit = np.broadcast_to(np.eye(p.own.covariance.shape[-1]), p.own.covariance.shape)
+        runs.append(p.with_values(covariance=unit, stated=np.ones(len(p.own.t), bool)))
     note = f"{e.said}: states no covariance; it is taken as I, which a factor for each component corrects"
-    return replace(e, runs=runs, stated=WHOLE, notes=(*e.notes, note), assumed=True)
+    return replace(e, runs=runs).with_error(stated=WHOLE, assumed=True).with_notes(note)
 
 
 def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
@@ -123,15 +123,15 @@ def windows_asked(r: Reading) -> Relative | None:
 def _judged(e: Estimator, r: Reading) -> list[int]:
     """Components of the error that are judged: those of ``--axes``, or all that are stated."""
     if r.components.axes is not None:
-        if unknown := set(r.components.axes).difference(e.axes):
+        if unknown := set(r.components.axes).difference(e.error.axes):
             first = next(axis for axis in r.components.axes if axis in unknown)
-            raise InputError(f"--axes {','.join(r.components.axes)}: '{first}' is not one of {', '.join(e.axes)}")
-        judged = [i for i, axis in enumerate(e.axes) if axis in r.components.axes]
-    elif e.judged is not None:
-        judged = list(e.judged)
+            raise InputError(f"--axes {','.join(r.components.axes)}: '{first}' is not one of {', '.join(e.error.axes)}")
+        judged = [i for i, axis in enumerate(e.error.axes) if axis in r.components.axes]
+    elif e.error.judged is not None:
+        judged = list(e.error.judged)
     else:
-        judged = list(range(len(e.axes)))
-    if e.in_space and e.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
+        judged = list(range(len(e.error.axes)))
+    if e.error.in_space and e.error.stated != WHOLE:  # a velocity or a bias that is 0 throughout is not estimated
         stated = np.any([p.variances.any(axis=0) for p in e.runs], axis=0)
         judged = [i for i in judged if i < len(AXES) or stated[i]]
     return judged
@@ -142,7 +142,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     runs = e.runs
     shift = 0.0
     level: list[str] = []
-    if e.in_space and r.components.axes is None:
+    if e.error.in_space and r.components.axes is None:
         judged, level = level_components(e, judged)
     of_clocks: list[str] = []
     fit = TruthFit()
@@ -153,58 +153,58 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         runs = moved.runs
         fit = moved.fit
         of_clocks += moved.notes
-    elif not runs[0].numbered:
+    elif not runs[0].source.numbered:
         from consistency.referee.readers.clocks import clock_shift
 
         shift, of_clocks = clock_shift(e.said, runs, r.matching.time_offset, judged)
     pairs = [_paired(e, p, r, shift) for p in runs]
     notes = [*e.notes, *_left_out(e, runs, pairs)]
     if _start_is_exact(e, runs):
-        pairs = [p.pairs(p.t != 0) for p in pairs]
+        pairs = [p.pairs(p.own.t != 0) for p in pairs]
     for i, p in enumerate(pairs):
-        if p.open_end and _is_cut(p, runs[i]):
-            pairs[i] = p.pairs(np.arange(len(p.t) - 1))
-            notes.insert(0, p.open_end)
+        if p.source.open_end and _is_cut(p, runs[i]):
+            pairs[i] = p.pairs(np.arange(len(p.own.t) - 1))
+            notes.insert(0, p.source.open_end)
     errors = [p.errors() for p in pairs]
-    if e.in_space:
+    if e.error.in_space:
         notes += _space_notes(e, pairs, errors)
         if r.components.axes is None:
             judged, still = estimated_components(e, errors, judged)
             notes += [*level, *still]
     causes = [*e.causes]
-    are_covariances = e.bounds is None or e.bounds.gaussian
-    if are_covariances and r.statement.ensemble is None and runs[0].members is None and not r.sources.repeats:
+    are_covariances = e.error.bounds is None or e.error.bounds.gaussian
+    if are_covariances and r.statement.ensemble is None and runs[0].own.members is None and not r.sources.repeats:
         causes = [*_causes(e, runs, shift, judged), *e.causes]
     notes += [*of_clocks, *causes]
-    if e.convention:
-        notes.append(f"error convention {e.convention}: {e.definition}")
+    if e.error.convention:
+        notes.append(f"error convention {e.error.convention}: {e.error.definition}")
     tracks = [_track(e, p, error) for p, error in zip(pairs, errors, strict=True)]
     tracks, t, numbering = _in_columns(e, pairs, tracks)
     notes += numbering
-    files = {p.run: str(p.files[0]) for p in runs}
+    files = {p.source.run: str(p.source.files[0]) for p in runs}
     records = []
-    for ending, group in e.stated.groups.items():
-        part = [i for i in range(len(e.axes))[group] if i in judged]
+    for ending, group in e.error.stated.groups.items():
+        part = [i for i in range(len(e.error.axes))[group] if i in judged]
         if not part:
             continue
         some = [track.part(part) for track in tracks]
-        axes = tuple(e.axes[i] for i in part)
+        axes = tuple(e.error.axes[i] for i in part)
         file, rows = str(e.covariances or e.path), bool(r.runs.independent)
-        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.convention, notes, independent=rows)
+        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.error.convention, notes, independent=rows)
         record = replace(
             record,
-            errors=replace(record.errors, assumed=e.assumed),
+            errors=replace(record.errors, assumed=e.error.assumed),
             runs=replace(record.runs, independent=rows),
             fit=fit,
             origin=replace(record.origin, files=files, causes=tuple(causes)),
         )
-        if e.stated.alone:
+        if e.error.stated.alone:
             record = each_alone(record)
-        if runs[0].members is not None:
+        if runs[0].own.members is not None:
             from consistency.referee.diagnostics.statistics.normal_numbers import of_ranks
 
-            members = np.concatenate([p.members for p in pairs if p.members is not None])
-            record = of_ranks(record, part, members, np.concatenate([p.truth for p in pairs]))
+            members = np.concatenate([p.own.members for p in pairs if p.own.members is not None])
+            record = of_ranks(record, part, members, np.concatenate([p.true.values for p in pairs]))
         records.append(record)
         notes = []
         causes = []
@@ -215,11 +215,12 @@ def _without_cross_terms(e: Estimator, judged: Sequence[int], N: int) -> Estimat
     """The estimator with variances alone where the covariance of N members has no full rank."""
     if N < 2:
         raise InputError(f"--ensemble {N}: must be the number of members, 2 or more")
-    if len(judged) < N or e.stated.alone:
+    if len(judged) < N or e.error.stated.alone:
         return e
-    runs = [replace(p, covariance=np.where(np.eye(p.covariance.shape[-1]), p.covariance, 0.0)) for p in e.runs]
+    unit = np.eye(e.runs[0].own.covariance.shape[-1])
+    runs = [p.with_values(covariance=np.where(unit, p.own.covariance, 0.0)) for p in e.runs]
     note = f"{e.said}: the covariance of {N} members has rank {N - 1}, so each component is judged by itself"
-    return replace(e, runs=runs, stated=ALONE, notes=(*e.notes, note))
+    return replace(e, runs=runs).with_error(stated=ALONE).with_notes(note)
 
 
 # --- estimates and truth ---------------------------------------------------------------------------
@@ -234,18 +235,18 @@ def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
         There is none, in a run that is not of an archive; or estimates and truth of a step have different times.
     """
     found = p.matched(shift)
-    if not len(found.t) and e.t is None:
+    if not len(found.own.t) and e.t is None:
         raise _nothing_known(e, p, shift)
-    if len(found.t) and not found.stated.any():
-        raise InputError(f"{p.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
-    found = found.pairs(found.stated)
-    if found.numbered and found.clock is not None and found.true_clock is not None:
-        t = found.clock
-        true_t = found.true_clock
-        where = f"in the same step of {p.files[1]}; number the same instants by the same step, or raise --max-dt"
+    if len(found.own.t) and not found.own.stated.any():
+        raise InputError(f"{p.source.files[0]}: no estimate has both a truth and a covariance within {p.max_dt:g} s")
+    found = found.pairs(found.own.stated)
+    if found.source.numbered and found.own.clock is not None and found.true.clock is not None:
+        t = found.own.clock
+        true_t = found.true.clock
+        where = f"in the same step of {p.source.files[1]}; number the same instants by the same step, or raise --max-dt"
         refuse(
             np.abs(t - true_t) > r.matching.tolerance + ROUNDING,
-            found.place.__getitem__,
+            found.own.place.__getitem__,
             lambda row: f"t is {exact(t[row])}, but {exact(true_t[row])} {where}",
         )
     return found
@@ -253,31 +254,32 @@ def _paired(e: Estimator, p: Poses, r: Reading, shift: float) -> Poses:
 
 def _nothing_known(e: Estimator, p: Poses, shift: float) -> InputError:
     """Message that no estimate of a run has a truth."""
-    if p.numbered:
-        own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.t, p.true_t))
-        return InputError(f"{p.files[0]}: no step of run {p.run} ({own}) is in {p.files[1]} ({true})")
+    if p.source.numbered:
+        own, true = (f"{each.min():.15g} to {each.max():.15g}" for each in (p.own.t, p.true.t))
+        estimates, truth = p.source.files
+        return InputError(f"{estimates}: no step of run {p.source.run} ({own}) is in {truth} ({true})")
     from consistency.referee.readers.clocks import nothing_near
 
     what = "estimate"
-    if len(e.runs) > 1 and e.runs[0].files == e.runs[-1].files:
-        what = f"estimate of run {p.run}"
-    return nothing_near(p.files, p.t + shift, p.true_t, p.max_dt, what, "truth")
+    if len(e.runs) > 1 and e.runs[0].source.files == e.runs[-1].source.files:
+        what = f"estimate of run {p.source.run}"
+    return nothing_near(p.source.files, p.own.t + shift, p.true.t, p.max_dt, what, "truth")
 
 
 def _start_is_exact(e: Estimator, runs: Sequence[Poses]) -> bool:
     """Whether step 0 is the start of every run, known exactly, and not an estimate."""
-    if not runs[0].numbered or e.t is not None or any((p.t < 0).any() for p in runs):
+    if not runs[0].source.numbered or e.t is not None or any((p.own.t < 0).any() for p in runs):
         return False
-    kinds = classify(np.concatenate([p.covariance[p.t == 0] for p in runs]), ROUNDED)
+    kinds = classify(np.concatenate([p.own.covariance[p.own.t == 0] for p in runs]), ROUNDED)
     return bool(np.isin(kinds, (Validity.DEFICIENT, Validity.INDEFINITE)).all())
 
 
 def _is_cut(p: Poses, whole: Poses) -> bool:
     """Whether the last row of a whole file has a covariance that is not positive definite, unlike the row before."""
-    if len(p.t) < 2 or p.t[-1] != whole.t[-1]:
+    if len(p.own.t) < 2 or p.own.t[-1] != whole.own.t[-1]:
         return False
-    before, last = classify(p.covariance[-2:], ROUNDED)
-    is_finite = np.isfinite(p.estimate[-1]).all() and np.isfinite(p.covariance[-1]).all()
+    before, last = classify(p.own.covariance[-2:], ROUNDED)
+    is_finite = np.isfinite(p.own.estimate[-1]).all() and np.isfinite(p.own.covariance[-1]).all()
     return bool(is_finite and before == Validity.VALID and last != Validity.VALID)
 
 
@@ -288,19 +290,19 @@ def _left_out(e: Estimator, runs: Sequence[Poses], pairs: Sequence[Poses]) -> li
     """Notes on left-out rows, and on a truth between whose samples estimates are."""
     notes = []
     what = "no truth"
-    total = sum(len(p.t) for p in runs)
-    left_out = total - sum(len(p.t) for p in pairs)
+    total = sum(len(p.own.t) for p in runs)
+    left_out = total - sum(len(p.own.t) for p in pairs)
     furthest = 0.0
     for p, found in zip(runs, pairs, strict=True):
-        if not p.stated.all():
+        if not p.own.stated.all():
             what = "no truth or no covariance"
-        if found.apart is not None:
-            furthest = max(furthest, found.apart.max(initial=0.0))
+        if found.interpolation is not None:
+            furthest = max(furthest, found.interpolation.apart.max(initial=0.0))
     if left_out:
-        if not runs[0].numbered:
+        if not runs[0].source.numbered:
             what += f" within {runs[0].max_dt:g} s (--max-dt)"
         notes.append(f"{e.said}: {left_out} of {total} estimates have {what} and are left out")
-    if furthest > ROUNDING and not e.in_space:
+    if furthest > ROUNDING and not e.error.in_space:
         notes.append(f"{e.said}: the truth is interpolated, from samples up to {furthest:.2g} s away")
     return notes
 
@@ -325,11 +327,12 @@ def _space_notes(e: Estimator, pairs: Sequence[Poses], errors: Sequence[Array]) 
 
 def _bent(p: Poses) -> Array:
     """What the interpolated truth may be off by, (k,), in standard deviations of the position."""
-    assert p.bend is not None
+    assert p.interpolation is not None
+    bend = p.interpolation.bend
     sigma = np.sqrt(np.abs(p.variances[:, :3]).mean(axis=1))
     bent = np.zeros(len(sigma))
-    some = (sigma > 0) & (p.bend > 1e-9)
-    bent[some] = p.bend[some] / sigma[some]
+    some = (sigma > 0) & (bend > 1e-9)
+    bent[some] = bend[some] / sigma[some]
     return bent
 
 
@@ -345,25 +348,25 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
 
 def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
-    if not e.in_space:
-        return _hints(e, runs, shift, range(len(e.axes)))
+    if not e.error.in_space:
+        return _hints(e, runs, shift, range(len(e.error.axes)))
     whole = []
-    if len(e.axes) > len(AXES):
+    if len(e.error.axes) > len(AXES):
         whole = _hints(e, runs, shift, judged)
     of_pose = [i for i in judged if i < len(AXES)]
     if whole or not of_pose:
         return whole
-    poses = replace(e, axes=e.axes[: len(AXES)])
+    poses = e.with_error(axes=e.error.axes[: len(AXES)])
     return _hints(poses, [p.alone() for p in runs], shift, of_pose)
 
 
 def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
     """Hints on mix-ups, which are loaded where the errors do not fit."""
-    if e.assumed or is_plausible(runs, shift, judged):
+    if e.error.assumed or is_plausible(runs, shift, judged):
         return []
     from consistency.referee.readers.mix_ups.hints import hints
 
-    return hints(e.said, e.axes, runs, shift, judged)
+    return hints(e.said, e.error.axes, runs, shift, judged)
 
 
 # --- records -----------------------------------------------------------------------------------------
@@ -372,27 +375,27 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
     path = t = ratios = None
-    if e.bounds is not None and p.bounds is not None:
+    if e.error.bounds is not None and p.own.bounds is not None:
         from consistency.referee.readers.formats.bounds import ratios_of
 
-        ratios = ratios_of(e.bounds, p.bounds, error)
-    width = e.position
+        ratios = ratios_of(e.error.bounds, p.own.bounds, error)
+    width = e.error.position
     if width:
-        true = p.truth[:, :width]
-        path = np.stack([true, p.estimate[:, :width]], axis=1)
-    if e.t is None and not (p.numbered and p.clock is None):  # an archive has the times of its steps
+        true = p.true.values[:, :width]
+        path = np.stack([true, p.own.estimate[:, :width]], axis=1)
+    if e.t is None and not (p.source.numbered and p.own.clock is None):  # an archive has the times of its steps
         t = p.seconds
     return Track(
-        p.run,
-        np.arange(len(p.t)),
-        p.place,
+        p.source.run,
+        np.arange(len(p.own.t)),
+        p.own.place,
         error,
-        p.covariance,
-        p.nis,
-        p.nis_dof,
-        by=p.by,
+        p.own.covariance,
+        p.own.nis,
+        p.own.nis_dof,
+        by=p.own.by,
         t=t,
-        truth_covariance=p.true_covariance,
+        truth_covariance=p.true.covariance,
         path=path,
         bound_ratios=ratios,
     )
@@ -404,19 +407,19 @@ def _in_columns(e: Estimator, pairs: Sequence[Poses], tracks: Sequence[Track]) -
     Runs without a row are left out, but for those of an archive, which numbers its steps.
     """
     if e.t is not None:
-        columns = [p.t.astype(np.int64) for p in pairs]
+        columns = [p.own.t.astype(np.int64) for p in pairs]
         return in_columns(tracks, columns), e.t, []
     keys = []
     seconds = []
     some = []
     for p, track in zip(pairs, tracks, strict=True):
-        if len(p.t):
-            keys.append(p.t)
+        if len(p.own.t):
+            keys.append(p.own.t)
             seconds.append(p.seconds)
             some.append(track)
     if not keys:
         raise InputError(f"{e.path}: holds the start alone, step 0, which is known exactly; add steps from 1 on")
-    if not pairs[0].numbered:
+    if not pairs[0].source.numbered:
         columns, t = common_times(keys)
         return in_columns(some, columns), t, []
     columns, steps = common_steps(keys)
@@ -434,11 +437,11 @@ def _innovations(e: Estimator, independent: bool) -> Record:
     """The record of innovations without errors; a step whose estimate is broken fails."""
     tracks = []
     for p in e.runs:
-        error = np.where(finite_rows(p.estimate), 0.0, np.nan)[:, None]
+        error = np.where(finite_rows(p.own.estimate), 0.0, np.nan)[:, None]
         tracks.append(replace(_track(e, p, error), covariance=None))
     tracks, t, numbering = _in_columns(e, e.runs, tracks)
     notes = [*e.notes, *numbering]
-    record = assemble(e.name, tracks, t, tuple(e.axes), str(e.path), "", notes, independent=independent)
+    record = assemble(e.name, tracks, t, tuple(e.error.axes), str(e.path), "", notes, independent=independent)
     errors = replace(record.errors, error=None, dof=0)
     return replace(record, errors=errors, runs=replace(record.runs, independent=independent))
 
@@ -447,15 +450,15 @@ def _record_of_windows(e: Estimator, judged: Sequence[int], r: Reading, relative
     """The record of motions over windows."""
     from consistency.referee.readers.pipeline.relative_motions import causes_of_motions, relative_recording
 
-    if e.stated != WHOLE:
+    if e.error.stated != WHOLE:
         raise InputError(f"{e.path}: --relative needs covariances of whole poses; here parts are stated apart")
     runs = []
     for p in e.runs:
         if relative.motions:
-            bare = np.append(False, ~p.stated[1:])
-            refuse(bare, p.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
-        elif p.cross is not None and not p.stated.all():
-            p = p.of_rows(np.flatnonzero(p.stated))
+            bare = np.append(False, ~p.own.stated[1:])
+            refuse(bare, p.own.place.__getitem__, f"this motion has no covariance within {p.max_dt:g} s")
+        elif p.own.cross is not None and not p.own.stated.all():
+            p = p.of_rows(np.flatnonzero(p.own.stated))
         p = p.later(r.matching.shift)
         if not len(p.known().rows):
             raise _nothing_known(e, p, 0.0)

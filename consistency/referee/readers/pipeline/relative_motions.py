@@ -58,8 +58,8 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
     InputError
         No window fits, a covariance is missing, or cross-covariances do not reach over a window.
     """
-    file = str(p.files[0])
-    if not relative.motions and p.cross is None:
+    file = str(p.source.files[0])
+    if not relative.motions and p.own.cross is None:
         raise InputError(f"{file}: --relative: {MARGINAL}")
     known = p.known()
     t = p.seconds
@@ -69,7 +69,7 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
     whole = last < sound
     first = first[whole]
     last = last[whole]
-    T = matrices(p.estimate[int(relative.motions) : sound])
+    T = matrices(p.own.estimate[int(relative.motions) : sound])
     if relative.motions:  # from the origin on
         T = composed(np.concatenate([np.eye(p.d + 1)[None], T]))
     true = matrices(known.truth)
@@ -83,28 +83,28 @@ def windows_of(p: Poses, relative: Relative) -> Windows:
         first = np.append(first, max(sound - 1, 0))
         last = np.append(last, sound)
         broken = 0.0
-        if not np.isfinite(p.estimate[sound]).all():
+        if not np.isfinite(p.own.estimate[sound]).all():
             broken = np.nan
         error = np.vstack([error, np.full(error.shape[1], broken)])
-        unknown = np.full((1, *p.covariance.shape[1:]), np.nan)
+        unknown = np.full((1, *p.own.covariance.shape[1:]), np.nan)
         covariance = np.concatenate([covariance, unknown])
     track = Track(
-        p.run,
+        p.source.run,
         np.arange(len(last)),
-        p.place.at(last),
+        p.own.place.at(last),
         error,
         covariance,
         t=t[first],
-        by=at(p.by, first),
+        by=at(p.own.by, first),
     )
     return Windows(track, error, covariance, t[last], left_out)
 
 
 def _sound(p: Poses, relative: Relative) -> int:
     """The first row that is broken; the first row of motions is only where they start."""
-    ok = finite_rows(p.estimate) & finite_rows(p.covariance)
-    if p.cross is not None:
-        ok[1:] &= finite_rows(p.cross[1:])
+    ok = finite_rows(p.own.estimate) & finite_rows(p.own.covariance)
+    if p.own.cross is not None:
+        ok[1:] &= finite_rows(p.own.cross[1:])
     if relative.motions:
         ok[0] = True
     return int(np.argmin(np.append(ok, False)))
@@ -113,32 +113,33 @@ def _sound(p: Poses, relative: Relative) -> int:
 def _of_motions(p: Poses, T: Array, first: Indices, last: Indices) -> Array:
     """Covariances of the windows' left errors from independent motions, (W, n, n)."""
     if not len(first):
-        return np.empty((0, *p.covariance.shape[1:]))
+        return np.empty((0, *p.own.covariance.shape[1:]))
     sizes = last - first
     begins = np.cumsum(sizes) - sizes
     window = np.repeat(np.arange(len(first)), sizes)
     rows = np.arange(sizes.sum()) - begins[window] + first[window] + 1
     own = to_left(inverse(T[rows - 1]) @ T[rows], p.convention)
     J = adjoint(inverse(T[last[window]]) @ T[rows]) @ own
-    return np.asarray(np.add.reduceat(propagated(J, p.covariance[rows]), begins))
+    return np.asarray(np.add.reduceat(propagated(J, p.own.covariance[rows]), begins))
 
 
 def _of_poses(p: Poses, T: Array, D: Array, first: Indices, last: Indices, relative: Relative) -> Array:
     """Covariances of the windows' left errors from the joint ones of their two ends, (W, n, n)."""
-    assert p.cross is not None
+    assert p.own.cross is not None
     sizes = last - first
     wide = np.flatnonzero(sizes != 1)
     if len(wide):
+        where = p.own.place[int(last[wide[0]])]
         raise InputError(
-            f"{p.place[int(last[wide[0]])]}: --relative {relative.option}: the window spans {sizes[wide[0]]} rows, but "
+            f"{where}: --relative {relative.option}: the window spans {sizes[wide[0]]} rows, but "
             "a cross-covariance reaches one row back; keep only the rows at the ends of windows, or take --relative 1"
         )
     start = to_left(T[first], p.convention)
     end = to_left(T[last], p.convention)
     J = np.concatenate([-adjoint(inverse(D)) @ start, end], axis=-1)
-    cross = p.cross[last]
+    cross = p.own.cross[last]
     mirrored = np.swapaxes(cross, -1, -2)
-    joint = np.block([[p.covariance[first], cross], [mirrored, p.covariance[last]]])
+    joint = np.block([[p.own.covariance[first], cross], [mirrored, p.own.covariance[last]]])
     return propagated(J, joint)
 
 
@@ -285,16 +286,16 @@ def causes_of_motions(
     for p in runs:
         known = p.known()
         most = slice(SEARCHED // len(runs))
-        t = p.t[known.rows[most]]
-        some.append(replace(p, true_t=t, truth=known.truth[most], true_covariance=None, max_dt=0.0))
+        t = p.own.t[known.rows[most]]
+        some.append(p.with_values(true_t=t, truth=known.truth[most], true_covariance=None, max_dt=0.0))
 
     def errors_without(change: Change) -> Pairs:
         found = []
         for p in some:
             with np.errstate(invalid="ignore"), suppress(InputError):  # infinite covariances; no window fits
                 changed = change(p)
-                if p.cross is not None:
-                    changed = replace(changed, cross=change(replace(p, covariance=p.cross)).covariance)
+                if p.own.cross is not None:
+                    changed = changed.with_values(cross=change(p.with_values(covariance=p.own.cross)).own.covariance)
                 one = windows_of(changed, relative)
                 found.append((one.error, one.covariance))
         return found

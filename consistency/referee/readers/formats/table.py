@@ -91,7 +91,7 @@ def _both(
     elif r.sources.truth is not None:
         truth, read_as = _sheet(r.sources.truth, axes, r.components.truth_columns, body=r.sources.body)
         run = (r.components.columns or {}).get("run")
-        if run in truth and "run" not in truth:  # of the same name in both
+        if run is not None and run in truth and "run" not in truth:  # of the same name in both
             truth = truth.renamed({"run": run})
         notes = [sheet.cut, truth.cut, notes[1], read_as]
     if r.statement.level is not None:

@@ -146,7 +146,7 @@ def second_order(
     b, D, B : as of :func:`carried`
     of_drive, of_turn : standard deviations of drive (m) and turn (rad)
     first : 0, or 3 for the two noises alone
-    ways : (5, 9), scratch array: by each error, the derivatives of b - rho s (3), with s the place of the sensor, and of
+    ways : (5, 9), scratch: by each error, the derivatives of b - rho s (3), with s the place of the sensor, and of
         rho; then a, e, t, l and k
     """
     rho, sine, cosine = y[2], np.sin(y[1]), np.cos(y[1])

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.questions import uncertain_truth
-from consistency.referee.diagnostics.questions.uncertain_truth import SharedError as SharedError
+from consistency.referee.diagnostics import uncertain_truth
+from consistency.referee.diagnostics.uncertain_truth import SharedError as SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection

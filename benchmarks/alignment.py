@@ -24,7 +24,7 @@ from scipy import signal, stats
 from script_options import options_of
 
 from consistency.diagnostics import Record, Settings, Verdict, judge, make_record
-from consistency.referee.diagnostics.records.record import TruthFit
+from consistency.referee.diagnostics.record import TruthFit
 from consistency.referee.geometry import wrap
 from consistency.referee.readers.alignment import Aligned, WorldTransform, clocks_and_frames, moved
 from consistency.referee.readers.clocks import clock_shift

@@ -37,7 +37,7 @@ from script_options import options_of
 import consistency as cs
 from consistency.bench.runs.results_to_records import record_of
 from consistency.diagnostics import Settings, Verdict, e_process, follow, judge, make_record, sequential_design
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.nees import nees
 from consistency.referee.types import Array
 
 BATCH = 25  # gates handed to a worker at once

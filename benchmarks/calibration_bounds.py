@@ -16,8 +16,8 @@ from scipy.signal import lfilter
 from scipy.special import ndtri
 
 from consistency.diagnostics import Settings, judge
-from consistency.referee.diagnostics.records.record import Bound, Errors, Record
-from consistency.referee.diagnostics.statistics.exceedance import betting, bound_runs, fewest_runs, gaffke
+from consistency.referee.diagnostics.exceedance import betting, bound_runs, fewest_runs, gaffke
+from consistency.referee.diagnostics.record import Bound, Errors, Record
 from consistency.referee.types import Array
 
 STEPS, GATES, QUICK_GATES, CHUNK = 50, 2000, 100, 250

@@ -16,11 +16,11 @@ from calibration_gates import Draw, first_order, row, shared, standard
 import consistency as cs
 from consistency.diagnostics import Settings, Verdict, judge, make_record
 from consistency.errors import InputError
-from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import equivalence
-from consistency.referee.diagnostics.records.groups import column_of, groups_of
-from consistency.referee.diagnostics.statistics.number_of_runs import group_runs
-from consistency.referee.diagnostics.verdict.parts import GROUP
+from consistency.referee.diagnostics.groups import column_of, groups_of
+from consistency.referee.diagnostics.number_of_runs import group_runs
+from consistency.referee.diagnostics.sample import Sample
+from consistency.referee.diagnostics.scale import equivalence
+from consistency.referee.diagnostics.verdict_parts import GROUP
 from consistency.referee.types import Array
 
 GATES, CONTROLS, POWERS = 1000, 200, 500

@@ -15,11 +15,11 @@ from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
 from calibration_gates import row, shared
 
 from consistency.diagnostics import Record, Settings, follow, gate_runs, judge, make_record, sequential_design
-from consistency.referee.diagnostics.judging.error_parts import run_tests
-from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records.groups import column_of, groups_of
-from consistency.referee.diagnostics.statistics.nees import e_processes, ever
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES, shares_of
+from consistency.referee.diagnostics.error_parts import run_tests
+from consistency.referee.diagnostics.groups import column_of, groups_of
+from consistency.referee.diagnostics.nees import e_processes, ever
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES, shares_of
 from consistency.referee.fit_covariance.correct import are_needed, fit_groups
 from consistency.referee.fit_covariance.factors import blocks_of
 from consistency.referee.types import Array

@@ -14,8 +14,8 @@ from calibration_gates import row, stationary
 from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics import Record, judge, make_record
-from consistency.referee.diagnostics.questions.planning import in_pieces
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.nees import nees
+from consistency.referee.diagnostics.planning import in_pieces
 from consistency.referee.geometry import SPATIAL, spatial_error
 from consistency.referee.types import Array
 

@@ -15,7 +15,7 @@ from calibration_gates import row
 from scipy.spatial.transform import Rotation
 
 from consistency.diagnostics import Verdict, judge, make_record, mean_shape
-from consistency.referee.diagnostics.verdict.parts import SHARES, STEP
+from consistency.referee.diagnostics.verdict_parts import SHARES, STEP
 from consistency.referee.types import Array
 
 RATES = (0.05, 1e-3)  # of commands and of gates

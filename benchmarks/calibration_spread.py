@@ -16,9 +16,9 @@ from calibration_gates import row
 from scipy import special, stats
 
 from consistency.diagnostics import Record, judge, make_record, ratio_interval
+from consistency.referee.diagnostics import scale
 from consistency.referee.diagnostics.comparison import RunSummary, compare
-from consistency.referee.diagnostics.questions import scale
-from consistency.referee.diagnostics.verdict.parts import SHARES
+from consistency.referee.diagnostics.verdict_parts import SHARES
 from consistency.referee.types import Array
 
 STEPS, GATE_STEPS = 2000, 100

@@ -15,10 +15,10 @@ from calibration_cases import DETECT, FALSE_ALARM, MOST, POWER
 from calibration_gates import row, shared, stationary
 
 from consistency.diagnostics import Settings, Verdict, follow, judge, make_record, sequential_design
-from consistency.referee.diagnostics.questions.planning import pilot_plan
-from consistency.referee.diagnostics.questions.scale import scale_test
-from consistency.referee.diagnostics.questions.whiteness import whiteness
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES
+from consistency.referee.diagnostics.planning import pilot_plan
+from consistency.referee.diagnostics.scale import scale_test
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES
+from consistency.referee.diagnostics.whiteness import whiteness
 from consistency.referee.types import Array
 
 GATES, PILOTS, DRAWS = 2000, 400, 3000

@@ -14,7 +14,7 @@ from calibration_gates import row, stationary
 from scipy import stats
 
 from consistency.diagnostics import judge, make_record
-from consistency.referee.diagnostics.questions.whiteness import ENOUGH, independence
+from consistency.referee.diagnostics.whiteness import ENOUGH, independence
 from consistency.referee.types import Array
 
 DOF = 3

@@ -23,11 +23,11 @@ import numpy as np
 from scipy import stats
 from script_options import options_of
 
-from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import Record, make_record
-from consistency.referee.diagnostics.records.whitening import squared_length, whiten
-from consistency.referee.diagnostics.statistics.nees import binomial_interval
+from consistency.referee.diagnostics.groups import Groups
+from consistency.referee.diagnostics.nees import binomial_interval
+from consistency.referee.diagnostics.record import Record, make_record
+from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.whitening import squared_length, whiten
 from consistency.referee.fit_covariance.correct import are_needed, correct, fit_groups, with_factors
 from consistency.referee.fit_covariance.factors import (
     SAME,

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.defaults import DETECT
-from consistency.referee.diagnostics.statistics.nees import binomial_interval
+from consistency.referee.diagnostics.nees import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
 from consistency.referee.fit_covariance.drives import Drive, drive_of

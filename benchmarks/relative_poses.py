@@ -21,8 +21,8 @@ from scipy.linalg import expm
 from script_options import options_of
 
 from consistency.diagnostics import Record, Verdict
-from consistency.referee.diagnostics.statistics.number_of_runs import power_of
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES
+from consistency.referee.diagnostics.number_of_runs import power_of
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES
 from consistency.referee.geometry import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places

@@ -21,7 +21,7 @@ from scipy import stats
 from script_options import options_of
 
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.questions.planning import within
+from consistency.referee.diagnostics.planning import within
 from consistency.referee.types import Array
 
 WORLDS = [

@@ -1,9 +1,6 @@
 """Statistics of filter consistency: arrays in, records and verdicts out; NumPy and SciPy are enough."""
 
-from consistency.referee.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
-from consistency.referee.diagnostics.judge_record import follow, judge, look, speaks
-from consistency.referee.diagnostics.monitor import Alarm, GateShare, Monitor
-from consistency.referee.diagnostics.questions.bias_and_shape import (
+from consistency.referee.diagnostics.bias_and_shape import (
     Hotelling,
     Largest,
     hotelling,
@@ -13,27 +10,35 @@ from consistency.referee.diagnostics.questions.bias_and_shape import (
     sphericity,
     t_squared,
 )
-from consistency.referee.diagnostics.questions.maps import clustered_share, map_score, rejection_score
-from consistency.referee.diagnostics.questions.planning import Design, PilotPlan, pilot_plan, sequential_design
-from consistency.referee.diagnostics.questions.scale import (
-    Band,
-    MeanTest,
-    equivalence,
-    mean_test,
-    ratio_interval,
-    simultaneous_band,
+from consistency.referee.diagnostics.comparison import Comparison, Difference, RunSummary, compare, summary
+from consistency.referee.diagnostics.distributions import Normality, normality
+from consistency.referee.diagnostics.judge_record import follow, judge, look, speaks
+from consistency.referee.diagnostics.maps import clustered_share, map_score, rejection_score
+from consistency.referee.diagnostics.monitor import Alarm, GateShare, Monitor
+from consistency.referee.diagnostics.nees import (
+    EProcess,
+    Pit,
+    anees,
+    anees_interval,
+    chi2_mean_interval,
+    coverage,
+    coverage_interval,
+    e_process,
+    ever,
+    nees,
+    noncredibility,
+    pit,
+    rmse,
 )
-from consistency.referee.diagnostics.questions.tails import Outlier, early_ends, lost_bound, outliers
-from consistency.referee.diagnostics.questions.whiteness import (
-    Independence,
-    Whiteness,
-    independence,
-    nis_of,
-    nis_test,
-    nis_whiteness,
-    whiteness,
+from consistency.referee.diagnostics.number_of_runs import (
+    detectable_ratio,
+    gate_runs,
+    lost_runs,
+    power_of,
+    required_runs,
 )
-from consistency.referee.diagnostics.records.record import (
+from consistency.referee.diagnostics.planning import Design, PilotPlan, pilot_plan, sequential_design
+from consistency.referee.diagnostics.record import (
     Bound,
     Ensemble,
     Errors,
@@ -52,31 +57,17 @@ from consistency.referee.diagnostics.records.record import (
     TruthFit,
     make_record,
 )
-from consistency.referee.diagnostics.records.whitening import spread_steps, standardise, whiten
-from consistency.referee.diagnostics.statistics.distributions import Normality, normality
-from consistency.referee.diagnostics.statistics.nees import (
-    EProcess,
-    Pit,
-    anees,
-    anees_interval,
-    chi2_mean_interval,
-    coverage,
-    coverage_interval,
-    e_process,
-    ever,
-    nees,
-    noncredibility,
-    pit,
-    rmse,
+from consistency.referee.diagnostics.scale import (
+    Band,
+    MeanTest,
+    equivalence,
+    mean_test,
+    ratio_interval,
+    simultaneous_band,
 )
-from consistency.referee.diagnostics.statistics.number_of_runs import (
-    detectable_ratio,
-    gate_runs,
-    lost_runs,
-    power_of,
-    required_runs,
-)
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.tails import Outlier, early_ends, lost_bound, outliers
+from consistency.referee.diagnostics.verdict import MapScore, Verdict
+from consistency.referee.diagnostics.verdict_parts import (
     Answer,
     EarlyEnds,
     Equivalence,
@@ -86,7 +77,16 @@ from consistency.referee.diagnostics.verdict.parts import (
     Settings,
     answers,
 )
-from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
+from consistency.referee.diagnostics.whiteness import (
+    Independence,
+    Whiteness,
+    independence,
+    nis_of,
+    nis_test,
+    nis_whiteness,
+    whiteness,
+)
+from consistency.referee.diagnostics.whitening import spread_steps, standardise, whiten
 
 __all__ = [
     "Alarm",

@@ -115,7 +115,7 @@ class Gates:
 
     def runs_of(self, item: pytest.Item, dof: int | None = None) -> int:
         """Runs given on the command line, or planned for the marker of a test, or as if it had ``dof``."""
-        from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
+        from consistency.referee.diagnostics.number_of_runs import gate_runs
 
         if self.runs is not None:
             return self.runs
@@ -144,7 +144,7 @@ class Gates:
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
         if self.path is not None and self.path.suffix.lower() == ".json":
-            from consistency.referee.diagnostics.verdict.verdict import plain
+            from consistency.referee.diagnostics.verdict import plain
 
             self.statistics.append(plain(entry.statistics))
 

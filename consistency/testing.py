@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.parts import Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.gating.checked_input import (
     Sides,
     bound_gate_runs,

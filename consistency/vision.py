@@ -6,7 +6,7 @@ Only :func:`relative_motion` and what else works on images needs OpenCV, the ext
 from consistency.referee.extras import explained_import
 
 with explained_import(__name__):
-    from consistency.referee.diagnostics.questions.uncertain_truth import SharedError
+    from consistency.referee.diagnostics.uncertain_truth import SharedError
     from consistency.stereo.visual_odometry.arrays import (
         ConsensusError,
         ConvergenceError,

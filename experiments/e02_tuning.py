@@ -7,7 +7,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script
-from consistency.referee.diagnostics.statistics.nees import TWO_SIGMA
+from consistency.referee.diagnostics.nees import TWO_SIGMA
 
 FINDINGS = ("fig2b", "fig2c")
 KERNELS = {"herath2007-xyz": ("ekf-xyz",)}

@@ -19,7 +19,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
 from consistency.diagnostics import Verdict, judge, make_record
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.nees import nees
 from consistency.referee.system.stopping import write_whole
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.odometry import SHARED, fit_shared, sensitivities

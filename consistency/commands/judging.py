@@ -42,8 +42,8 @@ from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.record import Record
-    from consistency.referee.diagnostics.records.record import Skip as FirstSteps
+    from consistency.referee.diagnostics.record import Record
+    from consistency.referee.diagnostics.record import Skip as FirstSteps
     from consistency.referee.readers.formats.innovation_files import NisLog
     from consistency.referee.verdicts.compare_sources import Baseline
     from consistency.referee.verdicts.judge_sources import Source

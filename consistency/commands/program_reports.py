@@ -6,8 +6,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Document
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy

@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.readers.options import OPTIONS, VALUES, Option, Reading, flag_of, make_reading
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.record import Record
+    from consistency.referee.diagnostics.record import Record
     from consistency.referee.document.blocks import Document
 
 

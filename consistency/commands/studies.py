@@ -49,7 +49,7 @@ def simulate_command(
     """Simulate a scenario, and write it as a log. A log has truth, controls and observations, for any filter."""
     from consistency.bench.runs.montecarlo import simulate_log
     from consistency.bench.scenario import load_scenario
-    from consistency.referee.diagnostics.words.numbers import plural
+    from consistency.referee.diagnostics.number_words import plural
 
     simulate_log(load_scenario(scenario), runs, seed, out, overwrite, form)
     count = plural(runs, "run")

@@ -3,7 +3,7 @@
 from dataclasses import fields, replace
 from typing import Any
 
-from consistency.referee.diagnostics.records.record import (
+from consistency.referee.diagnostics.record import (
     Errors,
     InnovationRecord,
     Map,

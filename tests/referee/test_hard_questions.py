@@ -8,10 +8,10 @@ import pytest
 from scipy import integrate, special, stats
 
 from consistency.diagnostics import hotelling, mean_shape, nis_whiteness, simultaneous_band, whiteness
-from consistency.referee.diagnostics.questions.bias_and_shape import products_test
-from consistency.referee.diagnostics.questions.scale import _log_nu_of_means
-from consistency.referee.diagnostics.questions.whiteness import cube_root_moments
-from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.bias_and_shape import products_test
+from consistency.referee.diagnostics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.scale import _log_nu_of_means
+from consistency.referee.diagnostics.whiteness import cube_root_moments
 
 RATE = 1e-5
 

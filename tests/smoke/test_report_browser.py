@@ -18,7 +18,7 @@ import pytest
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.commands import main
-from consistency.referee.diagnostics.verdict.parts import STATUSES
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.document.alarms import monitor_document
 from consistency.referee.document.blocks import Chapter, Document, Figure
 from consistency.referee.pages.record_figures import monitor_drawing

@@ -81,16 +81,16 @@ def test_the_question_of_the_document_is_asked(copy):
     """Two files; runs whose errors grow are found at fault, the same runs in random order are not."""
     statistic, (table, line) = example("trend.py"), code("Add a question of the verdict")
     folder = copy / "consistency/referee/diagnostics"
-    (folder / "questions/trend.py").write_text(statistic, encoding="utf-8")
-    tests = folder / "judging/error_parts.py"
+    (folder / "trend.py").write_text(statistic, encoding="utf-8")
+    tests = folder / "error_parts.py"
     first = "    distribution = pit(sample.nees, sample.dof)\n"
     changed(tests, first, f"    {line.strip()}\n{first}")
     changed(tests, "\n\n@dataclass(frozen=True)\nclass Tests", f"\n{table}\n\n@dataclass(frozen=True)\nclass Tests")
     changed(
-        tests, "from consistency.referee.diagnostics.records.whitening",
-        "from consistency.referee.diagnostics.questions.trend import trend\n"
-        "from consistency.referee.diagnostics.verdict.parts import ABOUT, ALONE, SHARES\n"
-        "from consistency.referee.diagnostics.records.whitening",
+        tests, "from consistency.referee.diagnostics.whitening",
+        "from consistency.referee.diagnostics.trend import trend\n"
+        "from consistency.referee.diagnostics.verdict_parts import ABOUT, ALONE, SHARES\n"
+        "from consistency.referee.diagnostics.whitening",
     )  # fmt: skip
     done = python(
         copy,

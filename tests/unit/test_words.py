@@ -18,10 +18,10 @@ from records import changed
 from scipy import stats
 
 from consistency.diagnostics import Interval, Settings, judge, make_record
-from consistency.referee.diagnostics.questions.tails import outliers
-from consistency.referee.diagnostics.verdict.parts import STATUSES
-from consistency.referee.diagnostics.verdict.verdict import plain
-from consistency.referee.diagnostics.words.numbers import off_by, p_text, plural, short
+from consistency.referee.diagnostics.number_words import off_by, p_text, plural, short
+from consistency.referee.diagnostics.tails import outliers
+from consistency.referee.diagnostics.verdict import plain
+from consistency.referee.diagnostics.verdict_parts import STATUSES
 from consistency.referee.document.blocks import Reasons, fragment
 from consistency.referee.document.tables import reason
 from consistency.referee.types import Failure

@@ -40,10 +40,10 @@ from consistency.bench.simulation import require_landmarks_in_view
 from consistency.bench.simulation.world import World
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
-from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.parts import JOINT, SCALE, Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
-from consistency.referee.diagnostics.words.numbers import p_text
+from consistency.referee.diagnostics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.number_words import p_text
+from consistency.referee.diagnostics.verdict import Verdict, plain
+from consistency.referee.diagnostics.verdict_parts import JOINT, SCALE, Settings
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import writing
 from consistency.referee.system.stopping import write_whole

@@ -21,8 +21,8 @@ from consistency.bench.runs.results_to_records import design_of, longest_run, ni
 from consistency.bench.store.results import open_results
 from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.verdict.parts import STATUSES, Settings
-from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural
+from consistency.referee.diagnostics.number_words import names_in_a_row, plural
+from consistency.referee.diagnostics.verdict_parts import STATUSES, Settings
 from consistency.referee.document.blocks import Chapter, Document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.verdicts import time_axis_of

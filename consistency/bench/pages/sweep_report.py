@@ -18,7 +18,7 @@ from consistency.bench.sweeps.run_sweep import CellResult
 from consistency.bench.sweeps.sweep_file import Axis as GridAxis
 from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import values_of
-from consistency.referee.diagnostics.words.numbers import names_in_a_row
+from consistency.referee.diagnostics.number_words import names_in_a_row
 from consistency.referee.document.blocks import (
     COLOURS,
     EXPECTED,

@@ -31,9 +31,9 @@ from consistency.bench.store.results import Results, StoredResults, Tables
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.judge_record import looks, progress_text
-from consistency.referee.diagnostics.questions.planning import Design, sequential_design
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.planning import Design, sequential_design
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import manifest_of, require_free
 from consistency.referee.system.progress import say

@@ -27,8 +27,8 @@ from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Cell, Column, Status, Table, table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading

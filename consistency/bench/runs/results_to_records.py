@@ -18,9 +18,9 @@ from scipy import stats
 from consistency.bench.store.parquet import Columns
 from consistency.bench.store.results import JOINT, Tables, open_results
 from consistency.referee.column_names import COLUMNS, COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics.questions import scale
-from consistency.referee.diagnostics.questions.planning import Design, sequential_design
-from consistency.referee.diagnostics.records.record import (
+from consistency.referee.diagnostics import scale
+from consistency.referee.diagnostics.planning import Design, sequential_design
+from consistency.referee.diagnostics.record import (
     Errors,
     InnovationRecord,
     JointNees,
@@ -32,9 +32,9 @@ from consistency.referee.diagnostics.records.record import (
     Skip,
     TruthFit,
 )
-from consistency.referee.diagnostics.records.whitening import by_runs, by_steps
-from consistency.referee.diagnostics.verdict.parts import Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import Settings
+from consistency.referee.diagnostics.whitening import by_runs, by_steps
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE, planar_error
 from consistency.referee.parsing import LARGEST_NUMBER, one_line

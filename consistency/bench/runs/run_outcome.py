@@ -35,8 +35,8 @@ from consistency.bench.store.parquet import Columns, Rejected, truth_columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial
 from consistency.referee.column_names import COVARIANCE, OWN_COVARIANCE, POINT_COVARIANCE, POSE
-from consistency.referee.diagnostics.questions.maps import joint_nees
-from consistency.referee.diagnostics.records.whitening import whiten
+from consistency.referee.diagnostics.maps import joint_nees
+from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import planar_error, planar_map_error, pose_error
 from consistency.referee.parsing import LARGEST_NUMBER

@@ -32,8 +32,8 @@ from consistency.bench.store.journal import Busy, Journal, Unfinished
 from consistency.bench.store.parquet import write_tables
 from consistency.bench.sweeps.sweep_file import Cell, Sweep, SweepFile, sweep_of
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
 from consistency.referee.system.folders import digest_of_sources, manifest_of, read_manifest, unfinished_of

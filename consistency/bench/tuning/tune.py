@@ -37,9 +37,9 @@ from consistency.bench.tuning.noise_factor_fit import (
 )
 from consistency.bench.types import Trial
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.verdict.parts import Interval, Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.verdict import Verdict, plain
+from consistency.referee.diagnostics.verdict_parts import Interval, Settings
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import manifest_of
 from consistency.referee.system.progress import quiet

@@ -10,10 +10,10 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.record import numbered_axes
-from consistency.referee.diagnostics.records.whitening import by_runs
-from consistency.referee.diagnostics.statistics.nees import Contrast, contrast, margin
+from consistency.referee.diagnostics.nees import Contrast, contrast, margin
+from consistency.referee.diagnostics.record import numbered_axes
+from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.whitening import by_runs
 from consistency.referee.types import Array, Indices
 
 FEWEST = 8  # runs; below, a standard error is worth nothing
@@ -147,7 +147,7 @@ def compare(
     log ratio_a > -log ratio_b, or if both hold with < in place of >. For each direction the larger of its two one-sided
     p values counts, and the p value is twice the smaller of the two. So the false-alarm rate is ``false_alarm`` at most
     wherever the ratios are, and half of it where both filters err to the same side. The one-sided tests are those of
-    ``consistency.referee.diagnostics.statistics.nees``.
+    ``consistency.referee.diagnostics.nees``.
 
     The comparison is of expectations. No such test holds for every distribution with heavy tails (Bahadur & Savage
     1956): if rare runs with a large NEES are missing from the sample, a covariance looks larger than it is. So a result

@@ -7,18 +7,18 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
-from consistency.referee.diagnostics.judging.status import deciding_axis
-from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.nees import e_processes, ever
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES, RejectionScore, Settings
-from consistency.referee.diagnostics.verdict.verdict import ConventionResult, Findings, MapScore, Verdict
-from consistency.referee.diagnostics.words.sentences import details, other_ways, reasons, sentences_of_conventions
+from consistency.referee.diagnostics.nees import e_processes, ever
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.sentences import details, other_ways, reasons, sentences_of_conventions
+from consistency.referee.diagnostics.status import deciding_axis
+from consistency.referee.diagnostics.verdict import ConventionResult, Findings, MapScore, Verdict
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES, RejectionScore, Settings
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.planning import Design
+    from consistency.referee.diagnostics.planning import Design
 
 DEFAULT = Settings()
 
@@ -30,7 +30,7 @@ def judge(
 
     Runs are independent, steps are not: every test takes a run as one observation, or holds under any
     dependence between steps. A filter whose errors are Gaussian with the stated covariance is found at fault in
-    any of the questions (``consistency.referee.diagnostics.verdict.parts``) with probability ``false_alarm`` at most;
+    any of the questions (``consistency.referee.diagnostics.verdict_parts``) with probability ``false_alarm`` at most;
     half of that belongs to the mean NEES, for which :func:`gate_runs` plans. A filter is *consistent* if no question
     found a fault, and two one-sided tests put the ratio of true to stated covariance inside [1 / detect, detect]; with
     ``lost``, the share of lost runs is shown to be at most that, too. Without a fault and without this evidence, the
@@ -66,21 +66,21 @@ def judge(
     if record.guesses:
         return _judge_conventions(record, settings, kept)
     if record.errors.bounds:
-        from consistency.referee.diagnostics.questions.bounds import findings_of_bounds
+        from consistency.referee.diagnostics.bounds import findings_of_bounds
 
         return _whole(record, findings_of_bounds(record, settings), record=kept)
     evidence = record.as_runs
     truth = None
     unshown = record.origin.unshown
     if record.truth.covariance is not None:
-        from consistency.referee.diagnostics.questions.uncertain_truth import uncertain_truth
+        from consistency.referee.diagnostics.uncertain_truth import uncertain_truth
 
         truth = uncertain_truth(record)
     if truth is not None:
         evidence = truth.evidence
         unshown = record.origin.unshown or truth.unjudged
     if evidence.errors.parts:
-        from consistency.referee.diagnostics.judging.record_findings import findings_of_parts
+        from consistency.referee.diagnostics.record_findings import findings_of_parts
 
         found = findings_of_parts(evidence, settings, unshown)
     else:
@@ -130,7 +130,7 @@ def _causes_of_level(found: Findings) -> list[str]:
     """Usual levels that would explain a covariance that is too large; their module is loaded for it."""
     if found.status != "conservative" or found.bounds:
         return []
-    from consistency.referee.diagnostics.words.faults import level_causes
+    from consistency.referee.diagnostics.fault_words import level_causes
 
     return level_causes(found)
 
@@ -139,7 +139,7 @@ def _same_truth(record: Record, found: Findings) -> list[str]:
     """That all runs have the same truth; its module is loaded where errors are smaller than stated in some step."""
     if found.location is None or not found.location.steps_below:
         return []
-    from consistency.referee.diagnostics.words.sentences import same_truth
+    from consistency.referee.diagnostics.sentences import same_truth
 
     return same_truth(record, found)
 
@@ -148,7 +148,7 @@ def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
     """Probable mix-ups of the innovations; their modules are loaded for a record that has some."""
     if record.innovations.nis is None and record.innovations.values is None:
         return []
-    from consistency.referee.diagnostics.questions.whiteness import innovation_causes, nis_and_dof
+    from consistency.referee.diagnostics.whiteness import innovation_causes, nis_and_dof
 
     innovations = nis_and_dof(record)
     nees_ratio = float("nan")
@@ -166,7 +166,7 @@ def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None
     landmarks = record.map.read()
     if landmarks is None:
         return None
-    from consistency.referee.diagnostics.questions.maps import last_nees, map_score
+    from consistency.referee.diagnostics.maps import last_nees, map_score
 
     if settings is None:
         landmarks = landmarks.of_runs(_end_of_runs(record))
@@ -183,7 +183,7 @@ def _rejections_of(record: Record, runs: int | None = None) -> RejectionScore | 
     """What a guard rejected in the first runs, or in all."""
     if record.map.rejections is None:
         return None
-    from consistency.referee.diagnostics.questions.maps import rejection_score
+    from consistency.referee.diagnostics.maps import rejection_score
 
     _, *counts = record.map.rejections.of_runs(runs)
     return rejection_score(*counts)

@@ -16,7 +16,7 @@ from scipy import special
 from scipy.optimize import brentq
 
 from consistency.referee.defaults import FALSE_ALARM, GATE_FALSE_ALARM
-from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics import distributions
 from consistency.referee.types import Array
 
 RATIOS = (1.1, 1.25, 1.5, 2.0, 4.0)  # of an alternative to the edge of the tolerance

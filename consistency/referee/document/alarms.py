@@ -8,8 +8,8 @@ import numpy as np
 
 from consistency.referee.defaults import FALSE_ALARM
 from consistency.referee.diagnostics.monitor import CAVEAT, RARE, Alarm, GateRatios, Monitor, accepted_scales
-from consistency.referee.diagnostics.verdict.verdict import CLOCK, MICROSECOND
-from consistency.referee.diagnostics.words.numbers import p_text, percent, plural
+from consistency.referee.diagnostics.number_words import p_text, percent, plural
+from consistency.referee.diagnostics.verdict import CLOCK, MICROSECOND
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Text, table
 
 SHOWN = 4  # dimensions of innovations, of which the smallest spike is printed

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from consistency.referee.diagnostics.words.numbers import short, with_subject
+from consistency.referee.diagnostics.number_words import short, with_subject
 
 INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
 SMALLEST = 1e-6  # p value below which digits say nothing

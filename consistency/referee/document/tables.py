@@ -13,10 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.status import clear
-from consistency.referee.diagnostics.verdict.parts import Interval, RejectionScore
-from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
-from consistency.referee.diagnostics.words.numbers import (
+from consistency.referee.diagnostics.number_words import (
     UNCERTAIN,
     p_text,
     percent,
@@ -26,7 +23,10 @@ from consistency.referee.diagnostics.words.numbers import (
     since_text,
     with_subject,
 )
-from consistency.referee.diagnostics.words.sentences import question_text
+from consistency.referee.diagnostics.sentences import question_text
+from consistency.referee.diagnostics.status import clear
+from consistency.referee.diagnostics.verdict import MapScore, Verdict
+from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
 from consistency.referee.document.blocks import (
     NONE,
     PLAIN,
@@ -115,7 +115,7 @@ def factor(v: Verdict) -> Quantity:
 def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
     """Ratio of true to stated covariance: of the axis that decides with its name, or of the whole; factor of bounds."""
     if v.bounds:
-        from consistency.referee.diagnostics.words.bounds import deciding, factor_text
+        from consistency.referee.diagnostics.bound_words import deciding, factor_text
 
         one = deciding(v.bounds)
         return f"{factor_text(one.factor)} x {one.name}"
@@ -270,7 +270,7 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         if v.lost is not None:
             rows.append((f"lost {v.unit}s", f"{v.lost.count} of {v.lost.runs}, at most {percent(v.lost.upper)} of all"))
     for one in v.bounds:
-        from consistency.referee.diagnostics.words.bounds import factor_text, level_text
+        from consistency.referee.diagnostics.bound_words import factor_text, level_text
 
         outside = f"outside in {percent(one.rate)} of the steps at {level_text(one.level)}"
         rows.append((one.name, f"factor {factor_text(one.factor)}, {outside}"))
@@ -449,7 +449,7 @@ def _percent_text(share: Interval) -> str:
 
 def bound_plan_lines(planned: dict[str, Any]) -> list[str]:
     """Runs that bounds of a level take, a line for each thing to be shown."""
-    from consistency.referee.diagnostics.words.bounds import level_text
+    from consistency.referee.diagnostics.bound_words import level_text
 
     p = planned
     level, factor, power = level_text(p["level"]), f"{p['detect']:.3g}", p["power"]

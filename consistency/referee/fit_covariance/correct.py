@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.scale import ratio_interval, run_means
-from consistency.referee.diagnostics.records.record import Map, Record, numbered_axes
-from consistency.referee.diagnostics.records.whitening import squared_length, whiten
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
-from consistency.referee.diagnostics.words.numbers import plural, short
+from consistency.referee.diagnostics.number_words import plural, short
+from consistency.referee.diagnostics.record import Map, Record, numbered_axes
+from consistency.referee.diagnostics.scale import ratio_interval, run_means
+from consistency.referee.diagnostics.verdict import Verdict, plain
+from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.whitening import squared_length, whiten
 from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named, shown
@@ -254,7 +254,7 @@ def require_runs(record: Record) -> None:
         raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
     runs = int(np.isfinite(record.errors.nees).any(axis=1).sum())
     if runs == 1:
-        from consistency.referee.diagnostics.questions.planning import FEWEST
+        from consistency.referee.diagnostics.planning import FEWEST
 
         raise InputError(
             f"{record.name}: one log has no other to judge its factors by; give several runs, or cut it with --split "

@@ -14,9 +14,9 @@ from scipy import special
 
 from consistency.referee.column_names import COVARIANCE
 from consistency.referee.defaults import DETECT
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.estimation import mean_over_runs
 from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array
 
 STEPS, SHORTEST = 100, 5e-4  # of scoring, and the part of a step that is tried last

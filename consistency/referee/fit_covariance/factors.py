@@ -3,7 +3,7 @@
 D is diagonal, with the square root of the factor of each component's block, and F with its floor. Runs are the unit of
 all intervals, so that nothing is assumed about how the steps of a run depend on each other. A run counts by its number
 of steps: with equal weights a right covariance would not have the factor 1 where runs end, or are in a group, by what
-was measured (see :func:`consistency.referee.diagnostics.questions.scale.RunMeans`).
+was measured (see :func:`consistency.referee.diagnostics.scale.RunMeans`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.estimation import (
     TAIL,

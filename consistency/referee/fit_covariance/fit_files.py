@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.groups import Groups
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.document.blocks import Chapter, Document, Figure, Text
 from consistency.referee.fit_covariance.correct import (
     ByGroup,

@@ -14,9 +14,9 @@ from scipy import linalg, stats
 
 from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
-from consistency.referee.diagnostics.words.numbers import plural, short
+from consistency.referee.diagnostics.number_words import plural, short
+from consistency.referee.diagnostics.verdict import Verdict, plain
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.estimation import interval_of, maximise, nees_of, score_of
 from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways

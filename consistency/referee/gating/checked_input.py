@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary
-from consistency.referee.diagnostics.questions.whiteness import nis_of
-from consistency.referee.diagnostics.records.record import InnovationRecord, Record, Skip, skip_of
+from consistency.referee.diagnostics.record import InnovationRecord, Record, Skip, skip_of
+from consistency.referee.diagnostics.whiteness import nis_of
 from consistency.referee.errors import InputError
 from consistency.referee.gating.session import Terms
 from consistency.referee.readers.formats.archives import steps_of
@@ -101,7 +101,7 @@ def record_of_checked(
 
 def bound_gate_runs(record: Record, terms: Terms) -> int:
     """Runs with which a gate passes right bounds, however steps depend on each other; a million at most."""
-    from consistency.referee.diagnostics.statistics.exceedance import LARGEST, runs_to_show
+    from consistency.referee.diagnostics.exceedance import LARGEST, runs_to_show
 
     return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
 

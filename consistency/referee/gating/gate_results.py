@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.comparison import Comparison
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Reason, Status, Table, fragment, table
 from consistency.referee.gating.checked_input import planned_dof, rate_shares
 from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
@@ -98,7 +98,7 @@ def summary_of(result: GateResult) -> dict[str, Any]:
     verdict = result.verdict
     axis, ratio = verdict.axis or (None, ())
     if verdict.bounds:
-        from consistency.referee.diagnostics.words.bounds import deciding
+        from consistency.referee.diagnostics.bound_words import deciding
 
         bound = deciding(verdict.bounds)
         axis, ratio = bound.name, bound.factor

@@ -160,7 +160,7 @@ def terms(
     ValueError
         An argument out of its range.
     """
-    from consistency.referee.diagnostics.verdict.parts import Settings
+    from consistency.referee.diagnostics.verdict_parts import Settings
 
     watch = current()
     given: dict[str, Any] = {
@@ -182,7 +182,7 @@ def terms(
 
 
 def fault_text(gate: str, name: str, reasons: Sequence[str]) -> str:
-    from consistency.referee.diagnostics.words.numbers import with_subject
+    from consistency.referee.diagnostics.number_words import with_subject
 
     first, *rest = reasons
     return "\n  - ".join([f"{gate}: {with_subject(name, first)}", *rest])
@@ -325,7 +325,7 @@ def settled(entry: Entry, rate: float, budget: float, gates: int) -> tuple[Entry
 def needed_at(entry: Entry, rate: float) -> int:
     """Runs that a gate asks for at a false-alarm rate."""
     from consistency.referee.diagnostics.comparison import Comparison
-    from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
+    from consistency.referee.diagnostics.number_of_runs import gate_runs
 
     if not entry.dof:  # of bounds, whose number does not depend on the rate
         return entry.needed

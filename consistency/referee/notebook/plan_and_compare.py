@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.extras import explained_import
 from consistency.referee.notebook.read_and_judge import read

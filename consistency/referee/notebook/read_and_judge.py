@@ -12,9 +12,9 @@ from typing import Any, cast
 from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.judge_record import judge as judge_record
-from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.record import Record, numbered_axes
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import document, summary
 from consistency.referee.errors import InputError, naming_arguments

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.statistics.nees import TWO_SIGMA
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN
+from consistency.referee.diagnostics.nees import TWO_SIGMA
+from consistency.referee.diagnostics.number_words import UNCERTAIN
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
 from consistency.referee.pages.verdicts import Judged
 from consistency.referee.show.figures import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from consistency.referee.diagnostics.verdict.parts import SIDES, ByGroup, Group
+from consistency.referee.diagnostics.verdict_parts import SIDES, ByGroup, Group
 from consistency.referee.document.blocks import ACCEPTED, BAND, REJECTED, Look
 
 if TYPE_CHECKING:

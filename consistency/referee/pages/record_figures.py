@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
+from consistency.referee.diagnostics import distributions
 from consistency.referee.diagnostics.monitor import GateRatios
-from consistency.referee.diagnostics.questions.uncertain_truth import of_both
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.uncertain_truth import of_both
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import BAND, EXPECTED, LIMIT, SIGMAS, TRUTH, ZERO, Figure, Look, solid, style
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import CHARTS

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict.parts import ABOUT, MAIN, Answer, BoundScore
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.bounds import level_text
-from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
+from consistency.referee.diagnostics.bound_words import level_text
+from consistency.referee.diagnostics.number_words import names_in_a_row, plural, short
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import ABOUT, MAIN, Answer, BoundScore
 from consistency.referee.document import blocks
 from consistency.referee.document.blocks import (
     Block,

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import plural, with_subject
+from consistency.referee.diagnostics.number_words import plural, with_subject
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Chapter, Document, Facts, Text, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
-from consistency.referee.diagnostics.questions.planning import Design, sequential_design
-from consistency.referee.diagnostics.records.record import Record, Skip
-from consistency.referee.diagnostics.statistics.number_of_runs import gate_runs
-from consistency.referee.diagnostics.verdict.parts import Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.number_of_runs import gate_runs
+from consistency.referee.diagnostics.planning import Design, sequential_design
+from consistency.referee.diagnostics.record import Record, Skip
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.gating.checked_input import planned_dof, rate_shares
 from consistency.referee.parsing import one_line

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.questions.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
-from consistency.referee.diagnostics.records.record import TruthFit
-from consistency.referee.diagnostics.records.whitening import by_runs, whiten
-from consistency.referee.diagnostics.verdict.parts import BIAS, GROUP, INNOVATIONS, MAIN, SHARES, STEP
+from consistency.referee.diagnostics.record import TruthFit
+from consistency.referee.diagnostics.residuals_of_fit import ENOUGH, inflation_of_mean, left_covariances
+from consistency.referee.diagnostics.verdict_parts import BIAS, GROUP, INNOVATIONS, MAIN, SHARES, STEP
+from consistency.referee.diagnostics.whitening import by_runs, whiten
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import (
     CHARTS,

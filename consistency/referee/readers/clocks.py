@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy import optimize
 
-from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.readers.runs_to_record import unchanging
 from consistency.referee.readers.truth_matching import Poses, evenly, finite_rows, submatrices

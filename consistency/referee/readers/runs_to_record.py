@@ -16,7 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import (
+from consistency.referee.diagnostics.nees import nees
+from consistency.referee.diagnostics.number_words import plural, short
+from consistency.referee.diagnostics.record import (
     INDEFINITE,
     Errors,
     InnovationRecord,
@@ -25,7 +27,7 @@ from consistency.referee.diagnostics.records.record import (
     Runs,
     Truth,
 )
-from consistency.referee.diagnostics.records.whitening import (
+from consistency.referee.diagnostics.whitening import (
     DEFICIENT,
     ROUNDED,
     Validity,
@@ -33,8 +35,6 @@ from consistency.referee.diagnostics.records.whitening import (
     classify,
     of_runs,
 )
-from consistency.referee.diagnostics.statistics.nees import nees
-from consistency.referee.diagnostics.words.numbers import plural, short
 from consistency.referee.errors import InputError
 from consistency.referee.readers.places import Places, listed, refuse
 from consistency.referee.readers.truth_matching import Estimator, Poses, at, finite_rows, submatrices

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.uncertain_truth import DECLARED
-from consistency.referee.diagnostics.records.record import Record, Truth
-from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.record import Record, Truth
+from consistency.referee.diagnostics.uncertain_truth import DECLARED
+from consistency.referee.diagnostics.whitening import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import Reading, flag_of
 

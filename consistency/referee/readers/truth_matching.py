@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Bound
-from consistency.referee.diagnostics.records.whitening import ROUNDED
+from consistency.referee.diagnostics.record import Bound
+from consistency.referee.diagnostics.whitening import ROUNDED
 from consistency.referee.geometry import planar_error, wrap
 from consistency.referee.readers.places import Places
 from consistency.referee.types import Array, Indices
@@ -291,7 +291,7 @@ class Poses:
         finite = finite_rows(estimate)
         out = np.full((len(rows), self.own.covariance.shape[-1]), np.nan)
         if self.own.members is not None:
-            from consistency.referee.diagnostics.statistics.normal_numbers import SEED, rank_numbers
+            from consistency.referee.diagnostics.normal_numbers import SEED, rank_numbers
 
             rng = np.random.default_rng((SEED, self.source.run))
             out[finite] = rank_numbers(self.own.members[rows][finite], truth[finite], rng)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.document.blocks import Document
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from consistency.referee.diagnostics.words.numbers import with_subject
+from consistency.referee.diagnostics.number_words import with_subject
 from consistency.referee.document.blocks import (
     PLAIN,
     Block,

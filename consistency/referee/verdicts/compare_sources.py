@@ -17,8 +17,8 @@ import numpy as np
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, RunSummary, compare, summary
-from consistency.referee.diagnostics.records.record import Record, Skip, numbered_axes
-from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.diagnostics.record import Record, Skip, numbered_axes
+from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.document.blocks import Block, Document, Text
 from consistency.referee.document.tables import comparison_table
 from consistency.referee.errors import InputError

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
-from consistency.referee.diagnostics.words.numbers import percent, plural, short
+from consistency.referee.diagnostics.number_words import percent, plural, short
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.whitening import ROUNDED, Validity, classify
 from consistency.referee.document.blocks import Block, Bullets, Document, Facts, Text, fragment
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import file_kinds, flight_logs

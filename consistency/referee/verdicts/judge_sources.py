@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import Settings
-from consistency.referee.diagnostics.verdict.verdict import Verdict
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.readers.pipeline.read_files import is_program_runs
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.planning import Design
-    from consistency.referee.diagnostics.records.record import Skip
+    from consistency.referee.diagnostics.planning import Design
+    from consistency.referee.diagnostics.record import Skip
 
 OPTION = {"ratio": "detect", "false_alarm": "false-alarm", "max_runs": "max-runs"}  # as commands call settings
 
@@ -131,7 +131,7 @@ def skip_asked(given: str | float | Skip | None) -> Skip | None:
     """
     if given is None:
         return None
-    from consistency.referee.diagnostics.records.record import skip_of
+    from consistency.referee.diagnostics.record import skip_of
 
     try:
         return skip_of(given)
@@ -171,14 +171,14 @@ def plan(
     InputError
         A number out of its range, or pilots without truth.
     """
-    from consistency.referee.diagnostics.questions.planning import Design, pilot_plan
-    from consistency.referee.diagnostics.statistics.number_of_runs import (
+    from consistency.referee.diagnostics.number_of_runs import (
         FEWEST_PLANNED,
         gate_runs,
         group_runs,
         lost_runs,
         required_runs,
     )
+    from consistency.referee.diagnostics.planning import Design, pilot_plan
 
     if allow not in (None, "conservative"):
         raise InputError(f"--allow must be 'conservative', got '{allow}'")
@@ -210,7 +210,7 @@ def plan(
 
 def plan_of_bounds(level: str | float, detect: float, false_alarm: float, power: float) -> dict[str, Any]:
     """Runs that bounds of a ``level`` take, by what they show; raises InputError for a number out of its range."""
-    from consistency.referee.diagnostics.statistics.exceedance import bound_runs
+    from consistency.referee.diagnostics.exceedance import bound_runs
     from consistency.referee.readers.formats.bounds import level_of_text
 
     settings = settings_of(detect=detect, false_alarm=false_alarm, power=power)
@@ -230,7 +230,7 @@ def pilots_of_records(
     InputError
         No such filter, one without truth, or too few runs that did not fail.
     """
-    from consistency.referee.diagnostics.questions.scale import FEW, run_means
+    from consistency.referee.diagnostics.scale import FEW, run_means
 
     named = {record.name: record for record in records}
     pilots = {}

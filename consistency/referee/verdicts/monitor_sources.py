@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.monitor import Alarm, Monitor
-from consistency.referee.diagnostics.records.record import Skip
+from consistency.referee.diagnostics.record import Skip
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.file_kinds import is_bag
 from consistency.referee.readers.formats.flight_logs import STATED, ULOG_SUFFIX, is_dataflash, read_stated, read_ulog

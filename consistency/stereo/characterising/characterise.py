@@ -17,7 +17,7 @@ from consistency.bench.models import observation
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.observations import bilinear, hats
 from consistency.bench.types import Trial
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.characterising import coordinate_fit

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize, special, stats
 
-from consistency.referee.diagnostics.statistics.distributions import normality
-from consistency.referee.diagnostics.statistics.nees import binomial_interval
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.distributions import normality
+from consistency.referee.diagnostics.nees import binomial_interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array, Indices
 
 LAGS = 10  # of the autocorrelation that is shown

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from consistency.bench.models import observation
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.observations import hats
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
 from consistency.stereo.characterising.characterise import (

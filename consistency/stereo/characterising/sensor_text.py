@@ -14,9 +14,9 @@ import numpy as np
 from consistency.bench.scenario import PicturedSensor, toml_text
 from consistency.bench.scenario.observations import BiasMap, DisparityGrowth
 from consistency.bench.store.recorded_log import sensor_keys
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.verdict.verdict import plain
-from consistency.referee.diagnostics.words.numbers import p_text
+from consistency.referee.diagnostics.number_words import p_text
+from consistency.referee.diagnostics.verdict import plain
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.system.folders import writing

@@ -4,7 +4,7 @@ Motions that the images do not tell are bridged from the motions around them.
 
 The motions of a drive share some errors: of the calibration of the rig, of the mounting and the clock of the truth.
 Pixel noise is independent from match to match; these are not, and no number of matches averages them out.
-``referee.diagnostics.questions.uncertain_truth`` fits them to a part of a drive, with a prior as wide as calibrations
+``referee.diagnostics.uncertain_truth`` fits them to a part of a drive, with a prior as wide as calibrations
 usually are, and predicts them for another.
 """
 
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from consistency.referee.diagnostics.questions import uncertain_truth
-from consistency.referee.diagnostics.questions.uncertain_truth import SharedError
+from consistency.referee.diagnostics import uncertain_truth
+from consistency.referee.diagnostics.uncertain_truth import SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import propagated
 from consistency.referee.system.progress import progress

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.archives import estimator_of_arrays
 from consistency.referee.readers.options import Reading

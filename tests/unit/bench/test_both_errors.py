@@ -16,8 +16,8 @@ from consistency.bench.runs.results_to_records import analyse, mean_nees_of_runs
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Interval, Settings, judge, map_score, sequential_design
 from consistency.referee.column_names import OWN_COVARIANCE
-from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.verdict.verdict import MapScore
+from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.diagnostics.verdict import MapScore
 from consistency.referee.document.tables import document, map_text
 from consistency.referee.gating.checked_input import record_of_filter
 from consistency.referee.show.terminal import show

@@ -16,8 +16,8 @@ import consistency as cs
 from consistency.bench.runs.results_to_records import analyse, record_of
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Settings, judge, make_record, summary
-from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records.whitening import all_finite, squared_length
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.whitening import all_finite, squared_length
 from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
 

@@ -13,9 +13,9 @@ from consistency.bench.filters import get_filter
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.runs.run_outcome import outcome_of
 from consistency.diagnostics import JointNees, Settings, judge, make_record
-from consistency.referee.diagnostics.questions.maps import joint_nees, joint_test, last_nees
-from consistency.referee.diagnostics.questions.scale import is_tolerated
-from consistency.referee.diagnostics.verdict.parts import JOINT, JOINT_DISTRIBUTION
+from consistency.referee.diagnostics.maps import joint_nees, joint_test, last_nees
+from consistency.referee.diagnostics.scale import is_tolerated
+from consistency.referee.diagnostics.verdict_parts import JOINT, JOINT_DISTRIBUTION
 from consistency.referee.geometry import planar_error, planar_map_error
 
 RUNS, LANDMARKS = 30, 12

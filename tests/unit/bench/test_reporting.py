@@ -37,8 +37,8 @@ from consistency.bench.runs.reproduce_findings import Finding
 from consistency.bench.store.results import read_results
 from consistency.diagnostics import Answer, Interval, Settings, judge, make_record
 from consistency.referee.column_names import COVARIANCE
-from consistency.referee.diagnostics.verdict.parts import DIRECTION, STATUSES, STEP
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.verdict_parts import DIRECTION, STATUSES, STEP
 from consistency.referee.document.blocks import Figure, written
 from consistency.referee.document.tables import FURTHER, page, shown_inside
 from consistency.referee.pages import ratio_figures, verdicts

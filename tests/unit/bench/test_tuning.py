@@ -35,8 +35,8 @@ from consistency.bench.tuning.tune import (
 )
 from consistency.commands import main
 from consistency.diagnostics import Settings
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.verdict_parts import Interval
 
 RUNS, SEED = 8, 60_321
 

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 import consistency as cs
 from consistency.commands.app import app
 from consistency.diagnostics import Settings, TruthFit, judge, make_record
-from consistency.referee.diagnostics.questions import residuals_of_fit
-from consistency.referee.diagnostics.questions.residuals_of_fit import (
+from consistency.referee.diagnostics import residuals_of_fit
+from consistency.referee.diagnostics.residuals_of_fit import (
     _at_most,
     _binned,
     _bins,
@@ -29,8 +29,8 @@ from consistency.referee.diagnostics.questions.residuals_of_fit import (
     inflation_of_mean,
     left_covariances,
 )
-from consistency.referee.diagnostics.questions.scale import equivalence
-from consistency.referee.diagnostics.verdict.parts import BIAS
+from consistency.referee.diagnostics.scale import equivalence
+from consistency.referee.diagnostics.verdict_parts import BIAS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import alignment as residuals

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from referee import judge
 
-from consistency.referee.diagnostics.records import whitening
+from consistency.referee.diagnostics import whitening
 from consistency.referee.types import Failure
 
 RUNS, STEPS = 61, 23

@@ -11,8 +11,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge
-from consistency.referee.diagnostics.records.record import Bound, Errors, Record, skip_of
-from consistency.referee.diagnostics.statistics.exceedance import (
+from consistency.referee.diagnostics.exceedance import (
     Exceedance,
     betting,
     bound_runs,
@@ -22,7 +21,8 @@ from consistency.referee.diagnostics.statistics.exceedance import (
     level_of,
     missing_steps,
 )
-from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.diagnostics.record import Bound, Errors, Record, skip_of
+from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.readers.formats.bounds import Levels, bound_columns, level_of_text
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent
 

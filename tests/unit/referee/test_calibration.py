@@ -22,7 +22,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import nis_of
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.nees import nees
 from consistency.referee.geometry import planar_error
 
 ROOT = Path(__file__).parents[3]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from consistency.referee.diagnostics.questions.scale import scale_test
+from consistency.referee.diagnostics.scale import scale_test
 
 
 @pytest.mark.parametrize("dof, n, group, share, runs", [(1, 2, 1, 0.5, 24), (2, 2, 1, 1.0, 20), (6, 6, 2, 0.5, 50)])

@@ -15,7 +15,7 @@ from scipy import optimize, special, stats
 import consistency as cs
 from consistency.bench.runs.results_to_records import results_source
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
-from consistency.referee.diagnostics.statistics.nees import Contrast, contrast, margin
+from consistency.referee.diagnostics.nees import Contrast, contrast, margin
 from consistency.referee.gating.session import RunningTest, needed_at, watching
 from consistency.referee.verdicts.compare_sources import (
     Compared,

@@ -8,7 +8,7 @@ from draws import autoregression, identities, independent, verdict_on
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.words.numbers import short
+from consistency.referee.diagnostics.number_words import short
 
 SURE = 1e-5
 

@@ -76,12 +76,12 @@ print(*(name.removeprefix("consistency.referee.") for name in sys.modules if nam
 """
     ours = said(folder, code).split()
     assert len(ours) <= 79
-    assert {"readers.formats.table", "diagnostics.questions.scale"} <= {*ours}
+    assert {"readers.formats.table", "diagnostics.scale"} <= {*ours}
     assert not {*ours} & {
         "readers.formats.ros_bag", "readers.formats.tum", "readers.formats.archives",
         "readers.pipeline.relative_motions",
-        "readers.mix_ups.known", "readers.alignment", "diagnostics.comparison", "diagnostics.questions.maps",
-        "diagnostics.monitor", "diagnostics.questions.uncertain_truth",
+        "readers.mix_ups.known", "readers.alignment", "diagnostics.comparison", "diagnostics.maps",
+        "diagnostics.monitor", "diagnostics.uncertain_truth",
     }  # fmt: skip
 
 

@@ -9,9 +9,9 @@ from records import changed
 from scipy import optimize, stats
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import make_record
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.groups import Groups
+from consistency.referee.diagnostics.nees import nees
+from consistency.referee.diagnostics.record import make_record
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct import (
     are_needed,

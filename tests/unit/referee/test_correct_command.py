@@ -13,7 +13,7 @@ from command import consistency, refused
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics.records.groups import Groups
+from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.fit_covariance.fit_files import place_in, toml
 
 RUNS, DRIVES, STEPS = 24, 8, 20

@@ -13,8 +13,10 @@ from scipy.spatial.distance import mahalanobis
 
 import consistency as cs
 from consistency.diagnostics import chi2_mean_interval, detectable_ratio, normality, rmse
-from consistency.referee.diagnostics.questions import tails
-from consistency.referee.diagnostics.records.whitening import (
+from consistency.referee.diagnostics import distributions as laws
+from consistency.referee.diagnostics import tails
+from consistency.referee.diagnostics.nees import coverage
+from consistency.referee.diagnostics.whitening import (
     DEFICIENT,
     EXACT,
     NEGATIVE,
@@ -24,9 +26,7 @@ from consistency.referee.diagnostics.records.whitening import (
     classify,
     negative,
 )
-from consistency.referee.diagnostics.records.whitening import FEWER as ROWS
-from consistency.referee.diagnostics.statistics import distributions as laws
-from consistency.referee.diagnostics.statistics.nees import coverage
+from consistency.referee.diagnostics.whitening import FEWER as ROWS
 
 # exact 95 % intervals of chi-square(3 N) / N, computed outside this project
 INTERVALS = {

@@ -9,7 +9,7 @@ from draws import autoregression, fully_dependent, independent, slow_axis, verdi
 from scipy import stats
 
 from consistency.diagnostics import largest_direction, ratio_interval
-from consistency.referee.diagnostics.questions.scale import RunMeans
+from consistency.referee.diagnostics.scale import RunMeans
 
 SURE = 1e-5
 

@@ -10,8 +10,8 @@ import pytest
 
 from consistency.diagnostics import Comparison, Interval, MapScore, judge, make_record
 from consistency.referee.diagnostics.comparison import Difference
-from consistency.referee.diagnostics.verdict.parts import ABOUT, ALONE, JointScore, RejectionScore
-from consistency.referee.diagnostics.words.sentences import reasons
+from consistency.referee.diagnostics.sentences import reasons
+from consistency.referee.diagnostics.verdict_parts import ABOUT, ALONE, JointScore, RejectionScore
 from consistency.referee.document.blocks import (
     PLAIN,
     PRINTED,

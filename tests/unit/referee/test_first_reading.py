@@ -13,9 +13,9 @@ from draws import identities, independent
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.numbers import UNCERTAIN, off_by, ratio_text, short
-from consistency.referee.diagnostics.words.sentences import reasons
+from consistency.referee.diagnostics.number_words import UNCERTAIN, off_by, ratio_text, short
+from consistency.referee.diagnostics.sentences import reasons
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.document.blocks import PLAIN, Quantity, written
 from consistency.referee.document.tables import TERMINAL, cells, document
 from consistency.referee.pages.write_pages import compose_files

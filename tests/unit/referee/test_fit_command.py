@@ -17,7 +17,7 @@ from fit_covariance import drives
 from numpy.testing import assert_allclose, assert_array_less
 
 import consistency as cs
-from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.extras import is_installed
 from consistency.referee.fit_covariance.covariance_ratios import write_motions
 from consistency.referee.fit_covariance.drives import drive_of

@@ -12,9 +12,7 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.questions.planning import in_pieces
-from consistency.referee.diagnostics.questions.scale import equivalence, ratio_interval, scale_test, weighted_of
-from consistency.referee.diagnostics.records.groups import (
+from consistency.referee.diagnostics.groups import (
     Column,
     column_of,
     groups_of,
@@ -22,8 +20,10 @@ from consistency.referee.diagnostics.records.groups import (
     on_steps,
     selects_on_outcome,
 )
-from consistency.referee.diagnostics.statistics.number_of_runs import group_runs, power_of, required_runs
-from consistency.referee.diagnostics.verdict.parts import GROUP, SHARES, shares_of
+from consistency.referee.diagnostics.number_of_runs import group_runs, power_of, required_runs
+from consistency.referee.diagnostics.planning import in_pieces
+from consistency.referee.diagnostics.scale import equivalence, ratio_interval, scale_test, weighted_of
+from consistency.referee.diagnostics.verdict_parts import GROUP, SHARES, shares_of
 from consistency.referee.pages.ratio_figures import ratio_by_group_figure
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal, assert_equal
 
-from consistency.referee.diagnostics.records.whitening import FEWER as ROWS
+from consistency.referee.diagnostics.whitening import FEWER as ROWS
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import text_blocks
 from consistency.referee.readers.formats.sheet import read_sheet

@@ -20,8 +20,8 @@ from consistency.diagnostics import (
     make_record,
     pilot_plan,
 )
-from consistency.referee.diagnostics.questions.tails import lost_evidence, lost_of
-from consistency.referee.diagnostics.statistics.number_of_runs import share_limit
+from consistency.referee.diagnostics.number_of_runs import share_limit
+from consistency.referee.diagnostics.tails import lost_evidence, lost_of
 from consistency.referee.gating.session import RunningTest, watching
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.judge_sources import plan

@@ -9,7 +9,7 @@ from scipy import special, stats
 
 import consistency as cs
 from consistency.errors import InputError
-from consistency.referee.diagnostics.statistics.normal_numbers import (
+from consistency.referee.diagnostics.normal_numbers import (
     TOGETHER,
     rank_numbers,
     rank_tables,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.questions.whiteness import outliers_of
+from consistency.referee.diagnostics.whiteness import outliers_of
 from consistency.referee.gating.checked_input import record_of_checked
 from consistency.referee.readers.axes_and_units import require_radians
 from consistency.referee.readers.formats.positions import placeholder

@@ -21,11 +21,11 @@ from consistency.diagnostics import (
     look,
     make_record,
 )
-from consistency.referee.diagnostics.judging.error_parts import _sum_of_correlations
-from consistency.referee.diagnostics.questions.maps import last_nees
-from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.records.whitening import every_entry, whiten, whiten_group
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.error_parts import _sum_of_correlations
+from consistency.referee.diagnostics.maps import last_nees
+from consistency.referee.diagnostics.number_words import ratio_text
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.verdict_parts import (
     MAIN,
     STEP,
     answers,
@@ -34,7 +34,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     least_of_steps,
     with_tolerated,
 )
-from consistency.referee.diagnostics.words.numbers import ratio_text
+from consistency.referee.diagnostics.whitening import every_entry, whiten, whiten_group
 from consistency.referee.gating.gate_results import GateResult, runs_to_decide
 from consistency.referee.types import Failure
 

@@ -14,8 +14,8 @@ from scipy import stats
 
 import consistency as cs
 from consistency.diagnostics import Settings, gate_runs, judge, make_record, ratio_interval
-from consistency.referee.diagnostics.records.record import each_alone
-from consistency.referee.diagnostics.records.whitening import diagonal
+from consistency.referee.diagnostics.record import each_alone
+from consistency.referee.diagnostics.whitening import diagonal
 from consistency.referee.gating.session import RunningTest, needed_at, watching
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent, assert_not_worse
 

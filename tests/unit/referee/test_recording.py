@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import consistency as cs
 from consistency.diagnostics import Settings
-from consistency.referee.diagnostics.statistics.nees import nees
+from consistency.referee.diagnostics.nees import nees
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import planar_error, se2_log, se3_log, spatial_error
 from consistency.referee.readers.truth_matching import associate, common_times

@@ -8,8 +8,8 @@ from numpy.testing import assert_array_equal
 
 import consistency as cs
 from consistency.diagnostics import Errors, InnovationRecord, Origin, Record, Runs, Truth
-from consistency.referee.diagnostics.records.groups import Groups
-from consistency.referee.diagnostics.records.record import arrays_of
+from consistency.referee.diagnostics.groups import Groups
+from consistency.referee.diagnostics.record import arrays_of
 from consistency.referee.types import Failure
 
 SHAPE = (5, 4)

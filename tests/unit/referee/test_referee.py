@@ -41,8 +41,8 @@ from consistency.diagnostics import (
     whiteness,
 )
 from consistency.diagnostics import judge as judge_record
-from consistency.referee.diagnostics.questions.tails import beyond_stated, outliers
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES
+from consistency.referee.diagnostics.tails import beyond_stated, outliers
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES
 
 AXES = ("x", "y", "heading")
 RUNS, STEPS, DOF = 100, 40, 3

@@ -16,8 +16,8 @@ from records import changed
 from relative_poses import AXES, DECLARED, drive, exp, motion_stretch, pose_stretch, recorded, vectors
 
 import consistency as cs
-from consistency.referee.diagnostics.questions.whiteness import ENOUGH
-from consistency.referee.diagnostics.verdict.verdict import plain
+from consistency.referee.diagnostics.verdict import plain
+from consistency.referee.diagnostics.whiteness import ENOUGH
 from consistency.referee.geometry import composed, matrices, propagated, to_left
 from consistency.referee.readers.pipeline.relative_motions import windows_of
 from consistency.referee.readers.runs_to_record import Relative

@@ -27,7 +27,7 @@ from consistency.diagnostics import (
     ratio_interval,
     required_runs,
 )
-from consistency.referee.diagnostics.questions.scale import (
+from consistency.referee.diagnostics.scale import (
     acceptance,
     equivalence,
     equivalence_by_betting,

@@ -13,10 +13,10 @@ from draws import fully_dependent, identities, independent
 from scipy import stats
 
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.verdict.parts import Interval
-from consistency.referee.diagnostics.words.faults import bias_text, scale_text, shape_text
-from consistency.referee.diagnostics.words.numbers import ratio_text, short
-from consistency.referee.diagnostics.words.sentences import reasons
+from consistency.referee.diagnostics.fault_words import bias_text, scale_text, shape_text
+from consistency.referee.diagnostics.number_words import ratio_text, short
+from consistency.referee.diagnostics.sentences import reasons
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.document.blocks import Quantity
 from consistency.referee.document.tables import TERMINAL, document, rows
 from consistency.referee.show.terminal import show

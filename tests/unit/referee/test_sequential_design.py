@@ -23,9 +23,9 @@ from consistency.diagnostics import (
     sequential_design,
 )
 from consistency.referee.diagnostics import judge_record
-from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
-from consistency.referee.diagnostics.questions.scale import equivalence, equivalence_by_betting
-from consistency.referee.diagnostics.statistics import nees as betting
+from consistency.referee.diagnostics import nees as betting
+from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.scale import equivalence, equivalence_by_betting
 from consistency.referee.types import Failure
 
 SURE = 1e-5

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 
-from consistency.referee.diagnostics.questions.uncertain_truth import fit_shared
+from consistency.referee.diagnostics.uncertain_truth import fit_shared
 from consistency.referee.errors import InputError
 
 N, SIZE = 480, 3

@@ -15,7 +15,7 @@ from single_log import errors
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.questions.planning import (
+from consistency.referee.diagnostics.planning import (
     APART,
     MOST,
     correlation_time,
@@ -23,8 +23,9 @@ from consistency.referee.diagnostics.questions.planning import (
     memory_of,
     within,
 )
-from consistency.referee.diagnostics.questions.tails import early_ends
-from consistency.referee.diagnostics.questions.whiteness import (
+from consistency.referee.diagnostics.tails import early_ends
+from consistency.referee.diagnostics.verdict_parts import BIAS
+from consistency.referee.diagnostics.whiteness import (
     ALIKE,
     ENOUGH,
     FEWEST_PIECES,
@@ -32,7 +33,6 @@ from consistency.referee.diagnostics.questions.whiteness import (
     SIZES,
     independence,
 )
-from consistency.referee.diagnostics.verdict.parts import BIAS
 from consistency.referee.geometry import SPATIAL
 from consistency.referee.verdicts.judge_sources import judge_all
 

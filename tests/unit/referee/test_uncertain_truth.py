@@ -14,7 +14,7 @@ from records import changed
 
 import consistency as cs
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.questions.uncertain_truth import (
+from consistency.referee.diagnostics.uncertain_truth import (
     contrasts,
     of_both,
     uncertain_truth,

@@ -15,11 +15,11 @@ from records import changed
 from scipy import stats
 
 from consistency.diagnostics import Settings, judge, make_record
-from consistency.referee.diagnostics.judging import error_parts
-from consistency.referee.diagnostics.questions.bias_and_shape import pair_p_values
-from consistency.referee.diagnostics.verdict.parts import ComponentRatios, Interval
-from consistency.referee.diagnostics.words.faults import factors_text, unlike_text
-from consistency.referee.diagnostics.words.sentences import reasons
+from consistency.referee.diagnostics import error_parts
+from consistency.referee.diagnostics.bias_and_shape import pair_p_values
+from consistency.referee.diagnostics.fault_words import factors_text, unlike_text
+from consistency.referee.diagnostics.sentences import reasons
+from consistency.referee.diagnostics.verdict_parts import ComponentRatios, Interval
 
 SURE = 1e-5
 INERTIAL = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")

@@ -23,14 +23,14 @@ from consistency.diagnostics import (
     speaks,
     spread_steps,
 )
-from consistency.referee.diagnostics.judging.error_parts import run_tests
-from consistency.referee.diagnostics.judging.record_findings import Inspection, findings_of
-from consistency.referee.diagnostics.questions.bias_and_shape import mean_shape, products_test
-from consistency.referee.diagnostics.questions.sample import sample_of
-from consistency.referee.diagnostics.questions.scale import RunMeans, equivalence_by_betting, ratio_interval, scale_test
-from consistency.referee.diagnostics.statistics.distributions import combined_p_value
-from consistency.referee.diagnostics.statistics.nees import EarlyMeans, e_process, e_processes, ever
-from consistency.referee.diagnostics.verdict.parts import MAIN, answers, named_p_values
+from consistency.referee.diagnostics.bias_and_shape import mean_shape, products_test
+from consistency.referee.diagnostics.distributions import combined_p_value
+from consistency.referee.diagnostics.error_parts import run_tests
+from consistency.referee.diagnostics.nees import EarlyMeans, e_process, e_processes, ever
+from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.sample import sample_of
+from consistency.referee.diagnostics.scale import RunMeans, equivalence_by_betting, ratio_interval, scale_test
+from consistency.referee.diagnostics.verdict_parts import MAIN, answers, named_p_values
 
 SURE = 1e-4
 

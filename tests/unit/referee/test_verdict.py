@@ -22,9 +22,9 @@ from consistency.diagnostics import (
     make_record,
 )
 from consistency.diagnostics import judge as judge_evidence
-from consistency.referee.diagnostics.records.record import Skip, Skipped
-from consistency.referee.diagnostics.verdict import parts
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics import verdict_parts as parts
+from consistency.referee.diagnostics.record import Skip, Skipped
+from consistency.referee.diagnostics.verdict_parts import (
     ABOUT,
     GROUP,
     JOINT,

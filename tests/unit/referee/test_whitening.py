@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-whitening = import_module("consistency.referee.diagnostics.records.whitening")
+whitening = import_module("consistency.referee.diagnostics.whitening")
 n = 5
 
 

@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.bench.scenario import PicturedSensor
 from consistency.bench.scenario.observations import BiasMap, bilinear, hats
 from consistency.bench.simulation import simulate
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising import coordinate_fit
 from consistency.stereo.characterising.characterise import (

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
-from consistency.referee.diagnostics.questions.uncertain_truth import posterior
+from consistency.referee.diagnostics.uncertain_truth import posterior
 from consistency.referee.errors import InputError
 from consistency.stereo.visual_odometry.odometry import (
     RIG,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
-from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.whitening import mean_and_count
-from consistency.referee.diagnostics.verdict.parts import STEP, Scale
-from consistency.referee.diagnostics.verdict.verdict import Verdict
-from consistency.referee.diagnostics.words.numbers import names_in_a_row, plural, short
-from consistency.referee.diagnostics.words.sentences import SPREAD
+from consistency.referee.diagnostics.number_words import names_in_a_row, plural, short
+from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.sentences import SPREAD
+from consistency.referee.diagnostics.verdict import Verdict
+from consistency.referee.diagnostics.verdict_parts import STEP, Scale
+from consistency.referee.diagnostics.whitening import mean_and_count
 from consistency.referee.document.blocks import EXPECTED, LIMIT, Figure
 from consistency.referee.pages.verdicts import wide
 from consistency.referee.show.figures import add_legend, band, canvas, curve, edges, log_axis, stroke

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.scenario import data_folder
-from consistency.referee.diagnostics.statistics.nees import binomial_interval
+from consistency.referee.diagnostics.nees import binomial_interval
 from consistency.referee.document.blocks import Block, Cell, Column, Details, Facts, Table, Text
 
 NAME = "calibration.json"

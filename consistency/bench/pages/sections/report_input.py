@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.pages.verdicts import Estimator, Judged
 from consistency.referee.types import Array
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.groups import on_steps
-from consistency.referee.diagnostics.records.record import (
+from consistency.referee.diagnostics.groups import on_steps
+from consistency.referee.diagnostics.record import (
     Errors,
     InnovationRecord,
     Record,

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.records.record import Bound, Record
-from consistency.referee.diagnostics.statistics.exceedance import deviations_of, level_of
+from consistency.referee.diagnostics.exceedance import deviations_of, level_of
+from consistency.referee.diagnostics.record import Bound, Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from consistency.referee.diagnostics.monitor import GateRatios
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading

@@ -167,7 +167,7 @@ def _with_nis(path: Path, arrays: dict[str, Array]) -> dict[str, Array]:
     keys = ("innovations", "innovation_covariances")
     if "nis" in arrays or not set(keys) <= set(arrays):
         return arrays
-    from consistency.referee.diagnostics.questions.whiteness import nis_of
+    from consistency.referee.diagnostics.whiteness import nis_of
 
     v, S = (arrays[key] for key in keys)
     are_numbers = v.dtype.kind in "fiu" and S.dtype.kind in "fiu"

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.whitening import all_finite
-from consistency.referee.diagnostics.statistics.normal_numbers import SEED, TOGETHER, is_joint
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.normal_numbers import SEED, TOGETHER, is_joint
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.whitening import all_finite
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.sheet import TableRows
 from consistency.referee.readers.options import Reading

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.records.whitening import diagonal
+from consistency.referee.diagnostics.whitening import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import INERTIAL, SPATIAL, wrap
 from consistency.referee.readers.clocks import UNIT_NAMES, nothing_near

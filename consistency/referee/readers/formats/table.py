@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.records.whitening import diagonal
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.whitening import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.column_names import OWN_COVARIANCE, POSE
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.readers.clocks import unit_of
 from consistency.referee.readers.formats.columns import (
@@ -469,7 +469,7 @@ def _with_innovations(sheet: TableRows, places: Mapping[str, int], dof: int | No
             S[:, i, j] = column
             if (j, i) not in stated.places:
                 S[:, j, i] = column
-        from consistency.referee.diagnostics.questions.whiteness import nis_of
+        from consistency.referee.diagnostics.whiteness import nis_of
 
         nis, degrees = nis_of(v, S)
         alone = ""

@@ -177,7 +177,7 @@ def _either(texts: Sequence[str]) -> str:
 def _status(fit: ReadingFit) -> int:
     """0 where the NEES is shown to be consistent, 1 where it may be, 2 where it is not."""
     from consistency.referee.diagnostics.judge_record import judge
-    from consistency.referee.diagnostics.records.record import make_record
+    from consistency.referee.diagnostics.record import make_record
 
     longest = max(map(len, fit.whitened))
     nees = np.full((len(fit.whitened), longest), np.nan)

@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.whitening import ROUNDED
-from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.whitening import ROUNDED
 from consistency.referee.readers.truth_matching import Poses, finite_rows, submatrices
 from consistency.referee.types import Array, Indices
 

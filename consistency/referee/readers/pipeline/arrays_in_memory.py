@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics.records.record import Record, each_alone
-from consistency.referee.diagnostics.records.whitening import diagonal
-from consistency.referee.diagnostics.words.numbers import is_or_are
+from consistency.referee.diagnostics.number_words import is_or_are
+from consistency.referee.diagnostics.record import Record, each_alone
+from consistency.referee.diagnostics.whitening import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.archives import estimator_of_arrays, first_known, require_layout
@@ -110,7 +110,7 @@ def record_of_arrays(
         if sigma is not None and not record.errors.bounds:
             record = each_alone(record)
         if reading.statement.ensemble is not None or are_repeats:
-            from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
+            from consistency.referee.diagnostics.normal_numbers import of_ensemble, of_repeats
 
             record = of_repeats(record) if are_repeats else record
             record = record if reading.statement.ensemble is None else of_ensemble(record, reading.statement.ensemble)

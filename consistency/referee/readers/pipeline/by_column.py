@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from consistency.referee.diagnostics.records.groups import (
+from consistency.referee.diagnostics.groups import (
     BINS,
     Column,
     column_of,
@@ -19,7 +19,7 @@ from consistency.referee.diagnostics.records.groups import (
     on_steps,
     selects_on_outcome,
 )
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.options import GroupOptions
 from consistency.referee.readers.truth_matching import ROUNDING, Estimator, Poses, evenly, submatrices

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.planning import Design, sequential_design
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.verdict.parts import Settings
-from consistency.referee.diagnostics.words.numbers import plural
+from consistency.referee.diagnostics.number_words import plural
+from consistency.referee.diagnostics.planning import Design, sequential_design
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, reading
 from consistency.referee.readers.formats.columns import TRUE, stem_of

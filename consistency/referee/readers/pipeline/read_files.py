@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from consistency.referee.diagnostics.records.record import Record
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import CHARTS, INERTIAL, PLANAR, SPATIAL
 from consistency.referee.parsing import is_file, read_json, require_name
@@ -296,7 +296,7 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
 
         records = declared(records, r)
     if r.sources.repeats or r.statement.ensemble is not None:
-        from consistency.referee.diagnostics.statistics.normal_numbers import of_ensemble, of_repeats
+        from consistency.referee.diagnostics.normal_numbers import of_ensemble, of_repeats
 
         if r.sources.repeats:
             records = [of_repeats(record) for record in records]
@@ -309,7 +309,7 @@ def _declared(records: list[Record], r: Reading) -> list[Record]:
     pieces = pieces_asked(r)
     if pieces is None:
         return records
-    from consistency.referee.diagnostics.questions.planning import in_pieces
+    from consistency.referee.diagnostics.planning import in_pieces
 
     return [in_pieces(record, pieces or None) for record in records]
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record, TruthFit, each_alone
-from consistency.referee.diagnostics.records.whitening import ROUNDED, Validity, classify
+from consistency.referee.diagnostics.record import Record, TruthFit, each_alone
+from consistency.referee.diagnostics.whitening import ROUNDED, Validity, classify
 from consistency.referee.errors import InputError
 from consistency.referee.readers.axes_and_units import require_radians
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
@@ -201,7 +201,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         if e.error.stated.alone:
             record = each_alone(record)
         if runs[0].own.members is not None:
-            from consistency.referee.diagnostics.statistics.normal_numbers import of_ranks
+            from consistency.referee.diagnostics.normal_numbers import of_ranks
 
             members = np.concatenate([p.own.members for p in pairs if p.own.members is not None])
             record = of_ranks(record, part, members, np.concatenate([p.true.values for p in pairs]))

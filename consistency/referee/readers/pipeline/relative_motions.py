@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.whiteness import ENOUGH, Independence, independence
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import whiten
-from consistency.referee.diagnostics.words.numbers import is_or_are, p_text, plural
+from consistency.referee.diagnostics.number_words import is_or_are, p_text, plural
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.whiteness import ENOUGH, Independence, independence
+from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import adjoint, composed, inverse, log, matrices, propagated, to_left
 from consistency.referee.readers.mix_ups.hints import Pairs, hints

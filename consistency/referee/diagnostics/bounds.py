@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from consistency.referee.defaults import GATE_FALSE_ALARM
-from consistency.referee.diagnostics.records.record import Bound, Record
-from consistency.referee.diagnostics.statistics.exceedance import (
+from consistency.referee.diagnostics.exceedance import (
     Exceedance,
     betting,
     fewest_runs,
@@ -23,7 +22,9 @@ from consistency.referee.diagnostics.statistics.exceedance import (
     missing_steps,
     runs_to_show,
 )
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.record import Bound, Record
+from consistency.referee.diagnostics.verdict import Findings
+from consistency.referee.diagnostics.verdict_parts import (
     Answer,
     BoundScore,
     Equivalence,
@@ -32,7 +33,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     faults_of,
     with_tolerated,
 )
-from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.types import Array
 
 OF_GROUPS = 0.5  # of the false-alarm rate, where groups are judged beside all steps

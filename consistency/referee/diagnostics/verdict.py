@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.record import Record, Skipped, shown_by
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.record import Record, Skipped, shown_by
+from consistency.referee.diagnostics.verdict_parts import (
     TINY,
     Accuracy,
     Answer,

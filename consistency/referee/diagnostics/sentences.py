@@ -1,4 +1,4 @@
-"""A verdict in words: a sentence to act on, then the figures behind it. How a single fault is said is in ``faults``."""
+"""A verdict in words: a sentence to act on, then the figures behind it. How one fault is said is in ``fault_words``."""
 
 from __future__ import annotations
 
@@ -7,24 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.status import clear
-from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.statistics.nees import TWO_SIGMA
-from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
-from consistency.referee.diagnostics.verdict.parts import (
-    SCALE,
-    ByGroup,
-    Equivalence,
-    Innovations,
-    Interval,
-    Location,
-    Scale,
-    Settings,
-    Within,
-)
-from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, ConventionResult, Findings, Verdict
-from consistency.referee.diagnostics.words.numbers import (
+from consistency.referee.diagnostics.nees import TWO_SIGMA
+from consistency.referee.diagnostics.number_of_runs import FEWEST_PLANNED
+from consistency.referee.diagnostics.number_words import (
     MOST,
     is_or_are,
     is_uncertain,
@@ -34,6 +19,21 @@ from consistency.referee.diagnostics.words.numbers import (
     ratio_text,
     short,
     since_text,
+)
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.sample import ATTITUDE, POSITION
+from consistency.referee.diagnostics.status import clear
+from consistency.referee.diagnostics.verdict import UNKNOWN_ENDS, ConventionResult, Findings, Verdict
+from consistency.referee.diagnostics.verdict_parts import (
+    SCALE,
+    ByGroup,
+    Equivalence,
+    Innovations,
+    Interval,
+    Location,
+    Scale,
+    Settings,
+    Within,
 )
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -102,7 +102,7 @@ def details(v: Findings) -> list[str]:
 def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
     """The sentence on errors, or without truth on innovations, and the figures behind it."""
     if v.bounds:
-        from consistency.referee.diagnostics.words.bounds import bounds_sentence, lines_of_bounds
+        from consistency.referee.diagnostics.bound_words import bounds_sentence, lines_of_bounds
 
         return bounds_sentence(v), lines_of_bounds(v)
     if v.scale is not None and v.scale.judged_steps:
@@ -111,7 +111,7 @@ def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
         if v.faults and v.parts:
             return _faults_of_parts(v), figures
         if v.faults:
-            from consistency.referee.diagnostics.words.faults import fault_sentence
+            from consistency.referee.diagnostics.fault_words import fault_sentence
 
             return fault_sentence(v, v.scale), figures
         return _no_fault(v, v.scale), figures
@@ -213,7 +213,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
     if v.by_group is not None or v.parts:
-        from consistency.referee.diagnostics.words.faults import right_groups
+        from consistency.referee.diagnostics.fault_words import right_groups
 
         axis += right_groups(v)
     if shown.shown:
@@ -326,7 +326,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         where = since_text(v)
         lines.append(f"covariance ratio of the worst axis{where}: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
     elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
-        from consistency.referee.diagnostics.words.faults import combination_text
+        from consistency.referee.diagnostics.fault_words import combination_text
 
         lines.append(f"no single axis is shown wrong; the error is {combination_text(v)}")
     lines += _groups(v.by_group, v.unit)
@@ -363,7 +363,7 @@ def _two_intervals(s: Scale, unit: str) -> list[str]:
 def _groups(by: ByGroup | None, unit: str) -> list[str]:
     if by is None:
         return []
-    from consistency.referee.diagnostics.words.faults import lines_of_groups
+    from consistency.referee.diagnostics.fault_words import lines_of_groups
 
     return lines_of_groups(by, unit)
 
@@ -460,7 +460,7 @@ def _without_truth(v: Findings, i: Innovations) -> str:
     parts = []
     shown = i.equivalence
     if v.faults:
-        from consistency.referee.diagnostics.words.faults import innovation_faults
+        from consistency.referee.diagnostics.fault_words import innovation_faults
 
         parts += innovation_faults(v, i)
     elif shown is not None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from consistency.referee.diagnostics.verdict.parts import TINY, Interval
-from consistency.referee.diagnostics.verdict.verdict import Findings
+from consistency.referee.diagnostics.verdict import Findings
+from consistency.referee.diagnostics.verdict_parts import TINY, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 SIDE = len("too small")  # or "too large", with which :func:`off_by` begins

@@ -17,14 +17,13 @@ import numpy as np
 from scipy import optimize
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.bias_and_shape import hotelling, t_squared
-from consistency.referee.diagnostics.questions.sample import Sample, sample_of
-from consistency.referee.diagnostics.questions.scale import equivalence, equivalent, scale_test
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import mean_of_runs
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.bias_and_shape import hotelling, t_squared
+from consistency.referee.diagnostics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.sample import Sample, sample_of
+from consistency.referee.diagnostics.scale import equivalence, equivalent, scale_test
+from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
     BIAS,
     MAIN,
@@ -39,6 +38,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     faults_of,
     least_of_steps,
 )
+from consistency.referee.diagnostics.whitening import mean_of_runs
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 

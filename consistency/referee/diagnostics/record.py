@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from consistency.referee.diagnostics.records.whitening import every_entry
+from consistency.referee.diagnostics.whitening import every_entry
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.groups import Groups
 
 INDEFINITE = "covariance is not positive definite"  # why a run failed
 FORMS = "a whole number of steps (20) or seconds (2s)"

@@ -12,11 +12,11 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.scale import UNKNOWN, RunMeans, ratio_interval
-from consistency.referee.diagnostics.records.whitening import all_finite, are_unlike, block_slices, by_runs, standardise
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.distributions import weighted_chi_square_tail
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.scale import UNKNOWN, RunMeans, ratio_interval
+from consistency.referee.diagnostics.verdict_parts import Interval
+from consistency.referee.diagnostics.whitening import all_finite, are_unlike, block_slices, by_runs, standardise
 from consistency.referee.types import Array, Indices
 
 FEWEST = 6  # runs that determine the size of an axis in a step

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.records.record import Ensemble, RatioTable, Record
-from consistency.referee.diagnostics.records.whitening import all_finite, every_entry, squared_length, whiten
-from consistency.referee.diagnostics.verdict.parts import BIAS
+from consistency.referee.diagnostics.record import Ensemble, RatioTable, Record
+from consistency.referee.diagnostics.verdict_parts import BIAS
+from consistency.referee.diagnostics.whitening import all_finite, every_entry, squared_length, whiten
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 

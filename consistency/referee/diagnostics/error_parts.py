@@ -12,8 +12,7 @@ from functools import partial
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.fault_location import location_of
-from consistency.referee.diagnostics.questions.bias_and_shape import (
+from consistency.referee.diagnostics.bias_and_shape import (
     Largest,
     StepMoments,
     hotelling,
@@ -24,8 +23,20 @@ from consistency.referee.diagnostics.questions.bias_and_shape import (
     step_moments,
     t_squared,
 )
-from consistency.referee.diagnostics.questions.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.questions.scale import (
+from consistency.referee.diagnostics.fault_location import location_of
+from consistency.referee.diagnostics.nees import (
+    Pit,
+    anees,
+    coverage,
+    coverage_interval,
+    noncredibility,
+    pit,
+    rmse,
+)
+from consistency.referee.diagnostics.number_of_runs import detectable_ratio
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.sample import ATTITUDE, POSITION, Sample
+from consistency.referee.diagnostics.scale import (
     Band,
     MeanTest,
     RunMeans,
@@ -36,26 +47,8 @@ from consistency.referee.diagnostics.questions.scale import (
     scale_test,
     simultaneous_band,
 )
-from consistency.referee.diagnostics.questions.tails import Outlier, beyond_stated, outliers
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import (
-    are_unlike,
-    block_slices,
-    by_runs,
-    mean_of_runs,
-    standardise,
-)
-from consistency.referee.diagnostics.statistics.nees import (
-    Pit,
-    anees,
-    coverage,
-    coverage_interval,
-    noncredibility,
-    pit,
-    rmse,
-)
-from consistency.referee.diagnostics.statistics.number_of_runs import detectable_ratio
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.tails import Outlier, beyond_stated, outliers
+from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
     BIAS,
     DIRECTION,
@@ -84,6 +77,13 @@ from consistency.referee.diagnostics.verdict.parts import (
     least_of_steps,
     shares_of,
     with_tolerated,
+)
+from consistency.referee.diagnostics.whitening import (
+    are_unlike,
+    block_slices,
+    by_runs,
+    mean_of_runs,
+    standardise,
 )
 from consistency.referee.types import Array, Indices
 
@@ -176,7 +176,7 @@ def scale_of(
         share_inside = float(inside[judged].mean())
     of_log = None
     if len(sample.nees) == 1:
-        from consistency.referee.diagnostics.questions.planning import within
+        from consistency.referee.diagnostics.planning import within
 
         of_log = within(sample.nees[0], dof, settings, shown.factor)
     accepted = acceptance(tests.main, dof, rate, settings.allow)
@@ -243,7 +243,7 @@ def by_group_of(
     both_sides = replace(settings, allow=None) if record.fit.reduced else settings
     factor = max(settings.factor, settings.tolerated)
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(there, 1)
-    from consistency.referee.diagnostics.records.groups import spans_of
+    from consistency.referee.diagnostics.groups import spans_of
 
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)

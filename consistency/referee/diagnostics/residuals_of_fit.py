@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, linalg, optimize
 
-from consistency.referee.diagnostics.statistics import distributions
+from consistency.referee.diagnostics import distributions
 from consistency.referee.types import Array
 
 ENOUGH = 20  # runs that show how their errors depend on each other

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import all_finite, by_runs, whiten
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.parts import NisTest, Outliers
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.verdict_parts import NisTest, Outliers
+from consistency.referee.diagnostics.whitening import all_finite, by_runs, whiten
 from consistency.referee.types import Array
 
 LAGS = 10

@@ -13,24 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.judging.error_parts import accuracy_of, bias_of, error_parts, excused, run_tests
-from consistency.referee.diagnostics.judging.status import (
-    few_lost,
-    nothing_judged,
-    status_by_errors,
-    status_by_innovations,
-    status_without_fault,
-    withheld,
-)
-from consistency.referee.diagnostics.questions.bias_and_shape import t_squared
-from consistency.referee.diagnostics.questions.sample import (
+from consistency.referee.diagnostics.bias_and_shape import t_squared
+from consistency.referee.diagnostics.error_parts import accuracy_of, bias_of, error_parts, excused, run_tests
+from consistency.referee.diagnostics.nees import chi2_mean_interval
+from consistency.referee.diagnostics.number_of_runs import FEWEST_PLANNED
+from consistency.referee.diagnostics.record import Errors, InnovationRecord, RatioTable, Record
+from consistency.referee.diagnostics.sample import (
     Sample,
     impossible_values,
     names_of,
     runs_and_steps,
     sample_of,
 )
-from consistency.referee.diagnostics.questions.scale import (
+from consistency.referee.diagnostics.scale import (
     FEW,
     equivalence,
     equivalence_by_betting,
@@ -40,12 +35,17 @@ from consistency.referee.diagnostics.questions.scale import (
     run_means,
     worst,
 )
-from consistency.referee.diagnostics.questions.tails import early_ends, lost_of
-from consistency.referee.diagnostics.records.record import Errors, InnovationRecord, RatioTable, Record
-from consistency.referee.diagnostics.records.whitening import every_entry, squared_length, whiten
-from consistency.referee.diagnostics.statistics.nees import chi2_mean_interval
-from consistency.referee.diagnostics.statistics.number_of_runs import FEWEST_PLANNED
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.status import (
+    few_lost,
+    nothing_judged,
+    status_by_errors,
+    status_by_innovations,
+    status_without_fault,
+    withheld,
+)
+from consistency.referee.diagnostics.tails import early_ends, lost_of
+from consistency.referee.diagnostics.verdict import UNKNOWN_ENDS, Findings
+from consistency.referee.diagnostics.verdict_parts import (
     JOINT,
     MAIN,
     SHARES,
@@ -64,19 +64,19 @@ from consistency.referee.diagnostics.verdict.parts import (
     named_p_values,
     with_tolerated,
 )
-from consistency.referee.diagnostics.verdict.verdict import UNKNOWN_ENDS, Findings
+from consistency.referee.diagnostics.whitening import every_entry, squared_length, whiten
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.maps import JointTest
-    from consistency.referee.diagnostics.questions.uncertain_truth import UncertainTruth
+    from consistency.referee.diagnostics.maps import JointTest
+    from consistency.referee.diagnostics.uncertain_truth import UncertainTruth
 
 INNOVATIONS = "innovations"
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.questions.planning`."""
+    """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.planning`."""
 
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
     # None where nothing but the scale is asked
@@ -216,7 +216,7 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
     """What the innovations say, and the p values of their questions where an optimal gain is declared."""
     if record.innovations.nis is None and record.innovations.values is None:
         return None, {}
-    from consistency.referee.diagnostics.questions.whiteness import (
+    from consistency.referee.diagnostics.whiteness import (
         nis_and_dof,
         nis_test,
         nis_whiteness,
@@ -256,7 +256,7 @@ def _innovations(record: Record, settings: Settings) -> tuple[Innovations | None
 def _joint(record: Record, settings: Settings) -> JointTest | None:
     if record.map.joint is None:
         return None
-    from consistency.referee.diagnostics.questions.maps import joint_test
+    from consistency.referee.diagnostics.maps import joint_test
 
     return joint_test(record.map.joint, settings, record.run_numbers, record.map.landmarks)
 

@@ -7,8 +7,8 @@ from bisect import bisect_left
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.verdict.parts import GROUP, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, shares_of
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.verdict_parts import GROUP, JOINT, JOINT_DISTRIBUTION, MAIN, SHARES, shares_of
 
 LARGEST = 10**7  # runs; more is refused as a mistake
 FEWEST_PLANNED = 30  # runs; a fault of 5 % of the runs is missing from fewer with more than .95^30 = 21 % probability

@@ -13,18 +13,18 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.questions.scale import FEW, LEAST, MeanTest, deciding_runs, run_means, scale_test
-from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.whitening import mean_of_runs, squared_length, whiten
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.number_of_runs import (
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.number_of_runs import (
     FEWEST_PLANNED,
     gate_runs,
     lost_runs,
     require_rates,
     required_runs,
 )
-from consistency.referee.diagnostics.verdict.parts import BIAS, MAIN, SHARES, Interval, Settings, Within
+from consistency.referee.diagnostics.record import Record, numbered_axes
+from consistency.referee.diagnostics.scale import FEW, LEAST, MeanTest, deciding_runs, run_means, scale_test
+from consistency.referee.diagnostics.verdict_parts import BIAS, MAIN, SHARES, Interval, Settings, Within
+from consistency.referee.diagnostics.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 
@@ -355,7 +355,7 @@ def _unshown(memory: ErrorMemory, pieces: int, length: int, parts: Array) -> str
             f"{pieces} pieces of {length} steps are not shown to be independent: errors last over {memory.time:.3g} "
             f"steps (up to {memory.upper:.3g}), about zero or in size, and pieces should be {whole}"
         )
-    from consistency.referee.diagnostics.questions.whiteness import independence
+    from consistency.referee.diagnostics.whiteness import independence
 
     if independence(mean_of_runs(parts), run_means(squared_length(parts))[0]).doubtful:
         return f"{pieces} pieces of {length} steps do not seem to be independent"

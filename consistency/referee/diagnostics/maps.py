@@ -11,12 +11,12 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.scale import ratio_interval
-from consistency.referee.diagnostics.records.record import JointNees, Record
-from consistency.referee.diagnostics.records.whitening import by_runs
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.nees import binomial_interval, kolmogorov
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.nees import binomial_interval, kolmogorov
+from consistency.referee.diagnostics.record import JointNees, Record
+from consistency.referee.diagnostics.scale import ratio_interval
+from consistency.referee.diagnostics.verdict import MapScore, Verdict
+from consistency.referee.diagnostics.verdict_parts import (
     JOINT,
     JOINT_DISTRIBUTION,
     Interval,
@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.verdict.parts import (
     RejectionScore,
     Settings,
 )
-from consistency.referee.diagnostics.verdict.verdict import MapScore, Verdict
+from consistency.referee.diagnostics.whitening import by_runs
 from consistency.referee.types import Array, Indices
 
 POSE, POINT = 3, 3  # degrees of freedom of a pose in the plane, and of a landmark in space

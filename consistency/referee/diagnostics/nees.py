@@ -16,7 +16,8 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM
-from consistency.referee.diagnostics.records.whitening import (
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.whitening import (
     all_finite,
     asymmetric,
     block_slices,
@@ -28,7 +29,6 @@ from consistency.referee.diagnostics.records.whitening import (
     squared_length,
     whiten,
 )
-from consistency.referee.diagnostics.statistics import distributions
 from consistency.referee.types import Array
 
 UP = np.array([0.1, 0.25, 0.5, 1.0])  # stakes against a covariance too small

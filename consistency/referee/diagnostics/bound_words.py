@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.verdict.parts import SIDES, BoundScore, Interval
-from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import MOST, names_in_a_row, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.number_words import MOST, names_in_a_row, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.verdict import Findings
+from consistency.referee.diagnostics.verdict_parts import SIDES, BoundScore, Interval
 
 DEPENDENCE = "however their steps depend on each other"
 

@@ -9,11 +9,27 @@ from collections.abc import Collection
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.error_parts import VISIBLE
-from consistency.referee.diagnostics.judging.status import smaller
-from consistency.referee.diagnostics.questions.scale import FEW
-from consistency.referee.diagnostics.records.groups import range_name
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.error_parts import VISIBLE
+from consistency.referee.diagnostics.groups import range_name
+from consistency.referee.diagnostics.number_words import (
+    MOST,
+    SIDE,
+    SMALLEST_P,
+    is_or_are,
+    is_uncertain,
+    names_in_a_row,
+    off_by,
+    off_by_factor,
+    p_text,
+    plural,
+    ratio_text,
+    short,
+    since_text,
+)
+from consistency.referee.diagnostics.scale import FEW
+from consistency.referee.diagnostics.status import smaller
+from consistency.referee.diagnostics.verdict import Findings
+from consistency.referee.diagnostics.verdict_parts import (
     ALONE,
     AXIS,
     BIAS,
@@ -33,22 +49,6 @@ from consistency.referee.diagnostics.verdict.parts import (
     Interval,
     JointScore,
     Scale,
-)
-from consistency.referee.diagnostics.verdict.verdict import Findings
-from consistency.referee.diagnostics.words.numbers import (
-    MOST,
-    SIDE,
-    SMALLEST_P,
-    is_or_are,
-    is_uncertain,
-    names_in_a_row,
-    off_by,
-    off_by_factor,
-    p_text,
-    plural,
-    ratio_text,
-    short,
-    since_text,
 )
 
 NOTABLE = 0.3  # difference of correlations that stands out in one step

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from consistency.referee.diagnostics.questions.scale import RunMeans, means_and_counts, run_means
-from consistency.referee.diagnostics.records.record import Record, numbered_axes
-from consistency.referee.diagnostics.records.whitening import (
+from consistency.referee.diagnostics.nees import EarlyMeans
+from consistency.referee.diagnostics.record import Record, numbered_axes
+from consistency.referee.diagnostics.scale import RunMeans, means_and_counts, run_means
+from consistency.referee.diagnostics.verdict_parts import Settings
+from consistency.referee.diagnostics.whitening import (
     all_finite,
     are_unlike,
     by_runs,
@@ -23,12 +25,10 @@ from consistency.referee.diagnostics.records.whitening import (
     whiten,
     whiten_group,
 )
-from consistency.referee.diagnostics.statistics.nees import EarlyMeans
-from consistency.referee.diagnostics.verdict.parts import Settings
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.records.groups import Groups
+    from consistency.referee.diagnostics.groups import Groups
 
 POSITION = {"x", "y", "z"}
 ATTITUDE = {"heading", "roll", "pitch", "yaw"}

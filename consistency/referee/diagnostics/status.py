@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.diagnostics.judging.error_parts import Tests, run_tests, sided_p_value
-from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
-from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.parts import (
+from consistency.referee.diagnostics.error_parts import Tests, run_tests, sided_p_value
+from consistency.referee.diagnostics.nees import anees
+from consistency.referee.diagnostics.sample import Sample
+from consistency.referee.diagnostics.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.verdict import Findings
+from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
     BIAS,
     DIRECTION,
@@ -34,11 +35,10 @@ from consistency.referee.diagnostics.verdict.parts import (
     at_share,
     faults_of,
 )
-from consistency.referee.diagnostics.verdict.verdict import Findings
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
-    from consistency.referee.diagnostics.questions.maps import JointTest
+    from consistency.referee.diagnostics.maps import JointTest
 
 SURE = 1.5  # standard errors by which the runs of a single step have to differ more than Gaussian ones
 

@@ -16,8 +16,8 @@ import numpy as np
 from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.statistics.distributions import chi2
-from consistency.referee.diagnostics.verdict.parts import Interval
+from consistency.referee.diagnostics.distributions import chi2
+from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.types import Array, Indices
 
 BETS = np.r_[0.002, 0.005, 0.01, 0.02, 0.05, np.linspace(0.1, 0.99, 19)]  # of the largest bet that cannot lose all

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.questions.sample import Sample
-from consistency.referee.diagnostics.questions.scale import Band, pointwise_band, ratio_interval, run_means
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.nees import anees
-from consistency.referee.diagnostics.verdict.parts import BIAS, MAIN, SCALE, STEP, TINY, Interval, Location, Until
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.nees import anees
+from consistency.referee.diagnostics.sample import Sample
+from consistency.referee.diagnostics.scale import Band, pointwise_band, ratio_interval, run_means
+from consistency.referee.diagnostics.verdict_parts import BIAS, MAIN, SCALE, STEP, TINY, Interval, Location, Until
 from consistency.referee.types import Array, Indices
 
 FEWEST = 8  # runs; with fewer the axes are not told apart

@@ -12,18 +12,18 @@ import numpy as np
 from scipy import optimize, special
 
 from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM
-from consistency.referee.diagnostics.records.whitening import (
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.distributions import combined_p_value, weighted_chi_square_tail
+from consistency.referee.diagnostics.nees import EarlyMeans, anees, anees_interval, e_processes, ever
+from consistency.referee.diagnostics.number_of_runs import LARGEST
+from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES, Equivalence, Interval, Settings
+from consistency.referee.diagnostics.whitening import (
     are_unlike,
     block_slices,
     by_runs,
     by_steps,
     mean_and_count,
 )
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.distributions import combined_p_value, weighted_chi_square_tail
-from consistency.referee.diagnostics.statistics.nees import EarlyMeans, anees, anees_interval, e_processes, ever
-from consistency.referee.diagnostics.statistics.number_of_runs import LARGEST
-from consistency.referee.diagnostics.verdict.parts import MAIN, SHARES, Equivalence, Interval, Settings
 from consistency.referee.types import Array, Indices
 
 FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from consistency.referee.diagnostics.questions.bias_and_shape import StepMoments, step_moments
-from consistency.referee.diagnostics.questions.scale import run_means
-from consistency.referee.diagnostics.records.record import Record
-from consistency.referee.diagnostics.records.whitening import block_slices, squared_length
-from consistency.referee.diagnostics.statistics import distributions
-from consistency.referee.diagnostics.statistics.nees import ever
-from consistency.referee.diagnostics.statistics.number_of_runs import lost_runs, share_limit
-from consistency.referee.diagnostics.verdict.parts import EarlyEnds, Lost, Settings
+from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.bias_and_shape import StepMoments, step_moments
+from consistency.referee.diagnostics.nees import ever
+from consistency.referee.diagnostics.number_of_runs import lost_runs, share_limit
+from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.scale import run_means
+from consistency.referee.diagnostics.verdict_parts import EarlyEnds, Lost, Settings
+from consistency.referee.diagnostics.whitening import block_slices, squared_length
 from consistency.referee.types import Array
 
 PARTS = np.array([0.0, 0.125, 0.25, 0.5])  # of the share in question: what the bet takes the true share to be

@@ -1,1 +1,0 @@
-"""The questions of a verdict, each a test in a file."""

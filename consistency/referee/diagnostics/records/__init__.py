@@ -1,1 +1,0 @@
-"""What the referee is given: the record, which covariances are valid, steps left out, whitened errors."""

@@ -1,1 +1,0 @@
-"""NEES, intervals, distributions and figures of merit."""

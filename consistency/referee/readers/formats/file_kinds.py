@@ -82,16 +82,18 @@ def is_spatial(path: Path, columns: Columns | None = None) -> bool:
 def is_poses(path: Path, columns: Columns | None = None) -> bool:
     """Whether a text file is of poses in space: by the names of its columns, or without names."""
     head = head_of(path, columns)
-    if head is None:
-        return begins_with_numbers(path)
-    found = pose_columns(head.names, path)
-    return "heading" not in head.names and found is not None and bool(found.quaternion)
+    return begins_with_numbers(path) if head is None else _are_in_space(head.names, path)
+
+
+def _are_in_space(names: Sequence[str], path: Path) -> bool:
+    found = pose_columns(names, path)
+    return "heading" not in names and found is not None and bool(found.quaternion)
 
 
 def is_plane(path: Path, columns: Columns | None = None) -> bool:
     """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
     head = head_of(path, columns)
-    if head is None or clock_of(head.names) is None or is_poses(path, columns):
+    if head is None or clock_of(head.names) is None or _are_in_space(head.names, path):
         return False
     return len(state_columns(head.names, POSE, PLAIN)) == len(POSE) or bool(rates_in(head.names))
 

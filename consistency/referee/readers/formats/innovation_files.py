@@ -66,7 +66,10 @@ def read_nis(path: Path, filter_name: str | None = None, run: int | None = None,
             raise InputError(f"--filter {filter_name}: does not go with {path}")
         refuse_options(path, r)
         return _of_archive(path, run)
-    return _of_table(path, filter_name, run, r)
+    sheet, note = with_nis(read_sheet(path, r.components.columns), r.statement.dof)
+    _require_columns(path, list(sheet.data))
+    sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
+    return _of_table(sheet, note)
 
 
 def refuse_options(path: Path, r: Reading) -> None:
@@ -109,10 +112,8 @@ def _require_columns(place: Path | str, columns: Sequence[str]) -> None:
                              f"{needed}=NAME says what it is called")  # fmt: skip
 
 
-def _of_table(path: Path, filter_name: str | None, run: int | None, r: Reading) -> NisLog:
-    sheet, note = with_nis(read_sheet(path, r.components.columns), r.statement.dof)
-    _require_columns(path, list(sheet.data))
-    sheet = _of_one(_of_one(sheet, "filter", filter_name), "run", run)
+def _of_table(sheet: TableRows, note: str) -> NisLog:
+    """The innovations of one run of one filter, in the order of their steps or times."""
     for key in ("step", "t"):
         if key in sheet:
             sheet = sheet.rows(row_order(sheet, np.zeros(len(sheet), int), key))
@@ -120,7 +121,7 @@ def _of_table(path: Path, filter_name: str | None, run: int | None, r: Reading) 
     sheet = with_clock(sheet, required=False)
     nis = sheet.numbers("nis")
     dof = checked_dof(nis, sheet.numbers("nis_dof"), sheet.place)
-    name = path.stem
+    name = sheet.path.stem
     step = np.arange(1.0, len(nis) + 1)
     t = np.full(len(nis), np.nan)
     if "filter" in sheet:

@@ -10,15 +10,15 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
+from consistency.bench.filters import compiled_guard as kernel_guard
 from consistency.bench.filters import guard as plain_guard
 from consistency.bench.filters.compiled import Compiled
+from consistency.bench.filters.compiled_guard import guard_part, keep_agreeing
 from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.filters.filter_declarations import problem_of
 from consistency.bench.filters.guard import KINDS, kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_guard_arrays
-from consistency.bench.filters.parts import guard as kernel_guard
-from consistency.bench.filters.parts.guard import guard_part, keep_agreeing
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Observation

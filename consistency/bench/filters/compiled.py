@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
+from consistency.bench.filters.compiled_guard import guard_part
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.filter_declarations import is_realisable, problem_for
@@ -19,7 +20,6 @@ from consistency.bench.filters.guard import KINDS, Guarded
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.filters.kernel.update_steps import REASONS
-from consistency.bench.filters.parts.guard import guard_part
 from consistency.bench.filters.parts.local import LOCAL_FROM, Local
 from consistency.bench.filters.parts.parking import Parking
 from consistency.bench.protocols import Filter, Problem

@@ -1,6 +1,6 @@
 """Guards in plain NumPy: which observations of a step each kind keeps, and a guard before any filter.
 
-The guard of compiled filters, with these rules in kernels, is ``parts.guard``.
+The guard of compiled filters, with these rules in kernels, is ``compiled_guard``.
 
 Of m known landmarks with s values each, a guard is given the innovation y (s m,) and its covariance S (s m, s m), both
 as the filter says them. Every decision needs no more than these two:

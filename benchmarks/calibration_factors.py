@@ -21,10 +21,12 @@ from consistency.referee.types import Array, Indices
 CELLS = {0.68: 100, 0.95: 100, 0.99: 400}  # runs by level
 STEPS, CHUNK, ALIKE = 50, 100, 3
 NARROW = 1.5  # upper over lower end
-COVERS, WIDTH = "bounds, factor covered", "bounds, factor known"
+CORRECTED_RUNS, HELD_OUT = (20, 60, 200), 200  # runs that ``correct`` has, and draws whose held-out rate is printed
+COVERS, WIDTH, LEAVES = "bounds, factor covered", "bounds, factor known", "bounds, corrected"
 ABOUT = {
     COVERS: "the 95 % interval of the factor by which a wrong bound must grow holds the right factor",
     WIDTH: f"the upper end of that interval is at most {NARROW:g} times the lower; nothing is promised",
+    LEAVES: "a step of a new run leaves a bound that `correct` has corrected",
 }
 
 
@@ -42,7 +44,25 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
             table.append(row(world, WIDTH, wrong**2, runs, 0.0, ">=", gates, int((high <= NARROW * low).sum())))
             middle = " ".join(f"{np.median(end) / wrong:.3f}" for end in (low, high, high / low * wrong))
             print(f"{world} x{wrong:.3g}: median ends over the right factor, and their ratio: {middle}", flush=True)
+    for runs, (name, phi) in product(CORRECTED_RUNS, CORRELATIONS.items()):
+        world = f"{name}, 95 %"
+        outside, rates = _corrected(drawn(seed, f"{world} corrected", runs), phi, 0.95, runs, gates)
+        table.append(row(world, LEAVES, WRONG**2, runs, 0.05, "<=", gates, outside))
+        rate, error = rates.mean(), 1.96 * rates.std() / len(rates) ** 0.5
+        print(f"{world}, {runs} runs: held out, {rate:.4f} +- {error:.4f} leave the corrected bound", flush=True)
     return table
+
+
+def _corrected(rng: np.random.Generator, phi: float, q: float, runs: int, gates: int) -> tuple[int, Array]:
+    """Draws in which a step of a new run leaves the corrected bound, and the held-out rate of some draws."""
+    found, rates = 0, []
+    for gate in range(gates):
+        r = np.abs(errors_of(rng, (runs + 1, STEPS), phi)) * WRONG / -ndtri((1.0 - q) / 2.0)
+        factor, left_out = Exceedance(r[:-1], np.zeros(runs, int), q).covering_factors()
+        found += int(r[-1, rng.integers(STEPS)] > factor)
+        if gate < HELD_OUT:
+            rates.append((r[:-1] > left_out[:, None]).mean())
+    return found, np.array(rates)
 
 
 def _intervals(

@@ -133,7 +133,7 @@ def _factors(record: Record, b: int, in_turn: bool) -> list[BoundFactor]:
         rows = "" if record.runs.independent else "; rows that do not depend on each other are runs with --independent"
         raise InputError(
             f"{bound.name}: {plural(there, record.runs.unit)} of {least} that a factor for {level_text(bound.level)} "
-            f"takes: with fewer, no finite factor is sure to hold its level for a new one; give more, or a lower level{rows}"
+            f"takes: with fewer, none is sure to hold its level for a new one; give more, or a lower level{rows}"
         )
     whole = _factor(bound, "", sizes)
     found = []

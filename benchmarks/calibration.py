@@ -40,6 +40,7 @@ from consistency.diagnostics import Settings, Verdict, e_process, follow, judge,
 from consistency.referee.diagnostics.nees import nees
 from consistency.referee.types import Array
 
+MANY = 10**9  # gates: no limit
 BATCH = 25  # gates handed to a worker at once
 CLEAR = 50  # gates after which a quick row ends where its promise is kept as far as it has come
 CHUNK = 2000  # runs of the Kalman filter in memory at once
@@ -58,6 +59,7 @@ MODULES = (
     "calibration_spread",
     "calibration_groups",
     "calibration_bounds",
+    "calibration_factors",
     "calibration_independent",
     "calibration_members",
 )  # each: rows(quick, seed), and ABOUT, its worlds and questions
@@ -241,23 +243,26 @@ def _share(folder: Path | None) -> None:
 
 
 def further_rows(
-    quick: bool, seed: int, workers: int = 2, modules: Sequence[str] | None = None
+    quick: bool, seed: int, workers: int = 2, modules: Sequence[str] | None = None, **some: Any
 ) -> tuple[list[Row], dict[str, str]]:
-    """Rows of other ``modules`` (all unless given), one a worker, and what their worlds and questions are."""
+    """Rows of other ``modules`` (all unless given), one a worker, and what their worlds and questions are.
+
+    ``some`` are further arguments of their rows, as ``only``.
+    """
     there = [name for name in modules or MODULES if importlib.util.find_spec(name) is not None]
     rows: list[Row] = []
     about: dict[str, str] = {}
     with ProcessPoolExecutor(workers) as pool:
-        for found, its in pool.map(_rows_of, there, repeat(quick), repeat(seed)):
+        for found, its in pool.map(_rows_of, there, repeat(quick), repeat(seed), repeat(some)):
             rows += [Row(**row) for row in found]
             about |= its
     return rows, about
 
 
-def _rows_of(name: str, quick: bool, seed: int) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def _rows_of(name: str, quick: bool, seed: int, some: dict[str, Any]) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """In a worker: what a module measures."""
     module = importlib.import_module(name)
-    return module.rows(quick, seed), module.ABOUT
+    return module.rows(quick, seed, **some), module.ABOUT
 
 
 # --- command ------------------------------------------------------------------------------------------------
@@ -302,7 +307,14 @@ def _measured(options: argparse.Namespace, seed: int) -> tuple[list[Row], dict[s
         rows.append(row)
         print(said(row), flush=True)
     modules = options.module or MODULES
-    further, about = ([], {}) if options.only else further_rows(options.quick, seed, options.workers, modules)
+    some: dict[str, Any] = {"only": options.only} if options.only else {}
+    if options.module and options.gates < MANY:
+        some["most"] = options.gates
+    further, about = (
+        further_rows(options.quick, seed, options.workers, modules, **some)
+        if options.module or not options.only
+        else ([], {})
+    )
     for row in further:
         print(said(row), flush=True)
     return rows + further, about
@@ -323,9 +335,9 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
         quick=(False, "fewer gates of fewer rows, with fresh random numbers"),
         out=(Path, "JSON file to write"),
         docs=(Path, "document whose table to replace"),
-        only=("", "rows whose world or question contains this text, put into --out"),
+        only=("", "rows whose world or question contains this text, put into --out; of a --module its worlds"),
         module=(str, "rows of this module alone, put into --out", {"action": "append", "choices": MODULES}),
-        gates=(10**9, "of a row, at most"),
+        gates=(MANY, "of a row, at most"),
         seed=(int, None),
         workers=(2, None),
     )

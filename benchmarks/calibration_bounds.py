@@ -21,6 +21,7 @@ from consistency.referee.diagnostics.record import Bound, Errors, Record
 from consistency.referee.types import Array
 
 STEPS, GATES, QUICK_GATES, CHUNK = 50, 2000, 100, 250
+MANY_GATES = 20_000  # where shares are 0 or 1, so that tests are exact and each cell is near what is promised
 VERDICTS, QUICK_VERDICTS = 400, 20
 LEVELS, RUNS = (0.68, 0.95, 0.99), (30, 100, 400)
 WRONG = 1.5  # ratio of covariances; the bound is wrong by its root, or for power by it
@@ -55,15 +56,15 @@ ABOUT |= {
 }  # fmt: skip
 
 
-def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
-    """Rows of the calibration table."""
-    gates = QUICK_GATES if quick else GATES
+def rows(quick: bool, seed: int, only: str = "") -> list[dict[str, Any]]:
+    """Rows of the calibration table, of worlds whose name has the text ``only``."""
     table: list[dict[str, Any]] = []
     for name, phi in CORRELATIONS.items():
         for q in LEVELS:
             world = f"{name}, {100 * q:g} %"
-            for runs in RUNS:
-                counts = _counted(_key(seed, world, runs), phi, q, runs, gates)
+            for runs in RUNS if only in world else ():
+                gates = QUICK_GATES if quick else MANY_GATES if phi == 1.0 and runs == RUNS[-1] else GATES
+                counts = _counted(drawn(seed, world, runs), phi, q, runs, gates)
                 table.append(row(world, FALSE, 1.0, runs, 0.05, "<=", gates, counts["fault"]))
                 if runs != RUNS[1]:
                     table.append(row(world, RARE, 1.0, runs, 0.001, "<=", gates, counts["rare"]))
@@ -71,35 +72,43 @@ def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
                     table.append(row(world, FLOOR, 1.0, runs, 0.0, "<=", gates, counts["floor"]))
                 for ratio in (WRONG, 1.0 / WRONG) if runs == RUNS[-1] else ():
                     table.append(row(world, CLEAR, ratio, runs, 0.05, "<=", gates, counts[f"clear {ratio > 1.0}"]))
+    gates = QUICK_GATES if quick else GATES
     for q in LEVELS:
         planned = bound_runs(q)
         world = f"constant, {100 * q:g} %"
         for question, ratio, needed in (
             (POWER, WRONG**2, planned.small), (POWER, WRONG**-2, planned.large), (RIGHT, 1.0, planned.consistent),
         ):  # fmt: skip
+            if only not in world:
+                continue
             assert needed is not None
-            counts = _counted(_key(seed, world, needed), 1.0, q, needed, gates, ratio**0.5)
+            counts = _counted(drawn(seed, world, needed), 1.0, q, needed, gates, ratio**0.5)
             found = counts["shown" if ratio == 1.0 else "small" if ratio > 1.0 else "large"]
             table.append(row(world, question, ratio, needed, 0.95, ">=", gates, found))
     for kind in ENDED:
         for name, phi in CORRELATIONS.items():
             for q in LEVELS:
                 world = f"{kind}, {name}, {100 * q:g} %"
-                counts = _counted(_key(seed, world, 100), phi, q, 100, gates, end=ENDED[kind])
+                if only not in world:
+                    continue
+                counts = _counted(drawn(seed, world, 100), phi, q, 100, gates, end=ENDED[kind])
                 table.append(row(world, ENDS, 1.0, 100, 0.05, "<=", gates, counts["fault"]))
     some = QUICK_VERDICTS if quick else VERDICTS
     for name in ("AR(.9)", "constant"):
-        rng = _key(seed, f"{name} verdicts", 100)
+        if only not in f"{name}, 95 %":
+            continue
+        rng = drawn(seed, f"{name} verdicts", 100)
         bad = sum(_is_fault(rng, CORRELATIONS[name]) for _ in range(some))
         table.append(row(f"{name}, 95 %", WHOLE, 1.0, 100, 0.05, "<=", some, bad))
     return table
 
 
-def _key(seed: int, world: str, runs: int) -> np.random.Generator:
+def drawn(seed: int, world: str, runs: int) -> np.random.Generator:
+    """Random numbers of one cell."""
     return np.random.default_rng((seed, zlib.crc32(world.encode()), runs))
 
 
-def _errors(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Array:
+def errors_of(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> Array:
     """Stationary unit Gaussian errors (..., steps)."""
     first = rng.standard_normal((*shape[:-1], 1))
     if phi == 1.0:
@@ -137,7 +146,7 @@ def _counted(
     a, near = 1.0 - q, WRONG**0.5
     for start in range(0, gates, CHUNK):
         shape = (min(CHUNK, gates - start), runs, STEPS)
-        r = np.abs(_errors(rng, shape, phi)) * size / -ndtri(a / 2.0)
+        r = np.abs(errors_of(rng, shape, phi)) * size / -ndtri(a / 2.0)
         length = end(rng, r > 1.0, r)
         there = np.arange(STEPS) < length[..., None]
         longest = np.maximum(length.max(axis=1, keepdims=True), 1)
@@ -167,6 +176,6 @@ def _counted(
 
 def _is_fault(rng: np.random.Generator, phi: float) -> bool:
     """Whether a whole verdict finds right bounds of 95 % on two components at fault."""
-    ratios = np.moveaxis(_errors(rng, (2, 100, STEPS), phi), 0, -1) / -ndtri(0.025)
+    ratios = np.moveaxis(errors_of(rng, (2, 100, STEPS), phi), 0, -1) / -ndtri(0.025)
     bounds = (Bound("bound_x", ("x",), 0.95), Bound("bound_y", ("y",), 0.95))
     return bool(judge(Record("gate", Errors(bounds=bounds, bound_ratios=ratios)), Settings()).faults)

@@ -23,11 +23,12 @@ SHAPES: dict[str, Callable[[Array], Array]] = {
     "skewed": lambda z: np.expm1(z),  # log-normal
     "heavy-tailed": lambda z: z * np.abs(z),
 }
-# members, components, shape, errors of a run
+# members, components, shape, errors of a run; the ranks of one component are the same in any shape
 RANKS = (
     *((m, n, "Gaussian", "AR(.5)") for m in (10, 20, 100) for n in (1, 3)),
     *((m, 1, "Gaussian", "constant") for m in (10, 20, 100)),
-    (20, 3, "skewed", "AR(.5)"), (20, 3, "heavy-tailed", "AR(.5)"), (20, 3, "skewed", "constant"),
+    *((m, 3, shape, "AR(.5)") for m in (10, 20, 100) for shape in ("skewed", "heavy-tailed")),
+    (20, 3, "skewed", "constant"),
 )  # fmt: skip
 WIDE = ((20, 40, "Gaussian", "AR(.5)"), (100, 40, "Gaussian", "AR(.5)"))
 ENSEMBLES = (*((N, 3, errors) for N in (5, 10, 50) for errors in ("AR(.5)", "constant")), (5, 8, "AR(.5)"))
@@ -112,8 +113,10 @@ def rows_of(
     return table
 
 
-def rows(quick: bool, seed: int) -> list[dict[str, Any]]:
+def rows(quick: bool, seed: int, only: str = "", most: int = GATES) -> list[dict[str, Any]]:
+    """Rows of the calibration table, of worlds whose name has the text ``only``, of ``most`` gates at most."""
     table = []
     for world, draw, case, runs, gates in cases()[::20] if quick else cases():
-        table += rows_of(world, draw, case, runs, QUICK_GATES if quick else gates, seed)
+        if only in world:
+            table += rows_of(world, draw, case, runs, QUICK_GATES if quick else min(gates, most), seed)
     return table

@@ -9,6 +9,7 @@ _MODULES = {
     "Alarm": "referee.diagnostics.monitor",
     "Compared": "referee.verdicts.compare_sources",
     "Control": "bench.types",
+    "BoundCorrection": "referee.fit_covariance.correct_bounds",
     "Correction": "referee.fit_covariance.correct",
     "Drive": "referee.fit_covariance.drives",
     "Finding": "bench.types",

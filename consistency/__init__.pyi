@@ -32,6 +32,7 @@ from .referee.diagnostics.record import make_record as make_record
 from .referee.diagnostics.verdict import Verdict as Verdict
 from .referee.errors import InputError as InputError
 from .referee.fit_covariance.correct import Correction as Correction
+from .referee.fit_covariance.correct_bounds import BoundCorrection as BoundCorrection
 from .referee.fit_covariance.drives import Drive as Drive
 from .referee.fit_covariance.drives import drive_of as drive_of
 from .referee.fit_covariance.drives import read_drives as read_drives

@@ -20,10 +20,12 @@ from consistency.referee.gating.checked_input import (
     bound_gate_runs,
     of_arrays,
     of_filters,
+    planned_detect,
     planned_dof,
     rate_shares,
     record_of_checked,
     record_of_filter,
+    record_of_read,
 )
 from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide
 from consistency.referee.gating.session import Terms, current, fault_text, few_to_compare, terms, undecided_text
@@ -54,13 +56,18 @@ class InsufficientTrials(ValueError):
 
 
 def assert_consistent(
-    errors: ArrayLike | Tables | None = None,
+    errors: ArrayLike | Record | Tables | None = None,
     covariances: ArrayLike | None = None,
     *,
     deviations: ArrayLike | None = None,
     bounds: ArrayLike | None = None,
     level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
     ends: str | None = None,
+    members: ArrayLike | None = None,
+    truth: ArrayLike | str | None = None,
+    ensemble: int | None = None,
+    independent: bool = False,
     filter: str | None = None,
     nees: ArrayLike | None = None,
     dof: ArrayLike | None = None,
@@ -90,12 +97,17 @@ def assert_consistent(
     Parameters
     ----------
     errors : (runs, steps, n), truth minus estimate, angles wrapped; or the results of ``consistency.run_trials``,
-        with ``filter`` the name of one in them. Steps without a truth are masked (``numpy.ma``) and do not count
+        with ``filter`` the name of one in them; or a record of :func:`consistency.read`, of files of any kind. Steps
+        without a truth are masked (``numpy.ma``) and do not count
     covariances : (runs, steps, n, n), in the squared units of the errors
     deviations : (runs, steps, n), in place of covariances where only standard deviations are stated: each component is
         judged by itself, at a false-alarm rate that all share, see :func:`consistency.judge`
-    bounds, level, ends : in place of covariances, as for :func:`consistency.judge`: bounds pass where the factor by
-        which they must grow is shown to lie within the root of ``detect``
+    bounds, level, gaussian, ends : in place of covariances, as for :func:`consistency.judge`: bounds pass where
+        the factor by which they must grow is shown to lie within the root of ``detect``
+    members, truth : in place of errors, draws (runs, steps, m, n) and the truth (runs, steps, n), as for
+        :func:`consistency.judge`; or truth "repeats": errors are estimates of the same true values
+    ensemble : number of members whose mean and sample covariance are given
+    independent : each row is an independent run, as of images; errors may then be (N, n)
     nees, dof : (runs, steps) and the dimension of the error, in place of errors and covariances; ``dof`` may be of
         each step, (steps,) or (runs, steps), where the state grows or shrinks
     false_alarm : probability of rejecting a correct filter; 0.001 unless an argument, marker or session sets it
@@ -137,18 +149,23 @@ def assert_consistent(
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     arrays: dict[str, Any] = {
         "covariances": covariances, "deviations": deviations, "bounds": bounds, "level": level, "ends": ends,
-        "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
+        "gaussian": gaussian or None, "members": members, "truth": truth, "ensemble": ensemble,
+        "independent": independent or None, "nees": nees, "dof": dof, "nis": nis, "nis_dof": nis_dof,
         "innovations": innovations, "innovation_covariances": innovation_covariances, "axes": axes,
     }  # fmt: skip
     if filter is not None or hasattr(errors, "estimates"):
         _refuse(arrays, "results bring their own")
         record = record_of_filter(_source(errors), filter, name, skip)
+    elif isinstance(errors, Record):
+        _refuse(arrays, "a record of consistency.read brings its own")
+        record = record_of_read(errors, name, optimal_gain, skip)
     else:
         if nees is not None and dof is None:
             arrays["dof"] = current().marked.get("dof")
+        there = {key: value for key, value in arrays.items() if value is not None}
         record = record_of_checked(
-            name or "the estimator", cast(ArrayLike, errors), **arrays, subsets=subsets, optimal_gain=optimal_gain,
-            skip=skip,
+            name or "the estimator", cast("ArrayLike | None", errors), **there, subsets=subsets,
+            optimal_gain=optimal_gain, skip=skip,
         )  # fmt: skip
 
     return _judged("assert_consistent", record, demand, subsets, method)
@@ -296,8 +313,9 @@ def _judged(
     def needed(rate: float) -> int:
         if record.errors.bounds:
             return bound_gate_runs(record, demand)
+        detect = planned_detect(record, demand.detect)
         return gate_runs(
-            planned_dof(record), demand.detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
+            planned_dof(record), detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
         )
 
     result = _settle(gate, record, demand, look, needed)
@@ -358,7 +376,8 @@ def _settle(
         if result.verdict is None:
             text = few_to_compare(gate, record.name, runs, least, demand)
         else:
-            each = replace(demand, false_alarm=demand.false_alarm / rate_shares(record))
+            share, detect = demand.false_alarm / rate_shares(record), planned_detect(record, demand.detect)
+            each = replace(demand, false_alarm=share, detect=detect)
             level = record.errors.bounds[0].level if record.errors.bounds else None
             text = undecided_text(gate, record.name, result.reasons[0], least, dof, each, level)
             text += marker_text(dof, runs) if level is None else ""

@@ -147,8 +147,9 @@ def correct_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Find factors for a stated covariance, or variances where none is. Judge them on runs that chose nothing."""
+    """Find factors for stated covariances or bounds, or variances where none is. Judge them on held-out runs."""
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
+    from consistency.referee.fit_covariance.correct_bounds import BoundCorrection, bound_correction_document
     from consistency.referee.readers.formats.restated import text_files
     from consistency.referee.system.folders import require_free
     from consistency.referee.verdicts.judge_sources import skip_asked
@@ -161,7 +162,7 @@ def correct_command(
     align = files.matching.align
     if per is not None and align not in (None, "none", "origin"):
         raise InputError(f"--per axis: does not go with --align {align}, which turns the axes of the covariances")
-    files = files.with_options(unstated=True)
+    files = files.with_options(unstated=files.statement.level is None)
     records = read_files(path, files)
     record = the_record(records, name).without_first(skip_asked(skip))
     texts = text_files(path, files, record.name)
@@ -173,10 +174,14 @@ def correct_command(
     written: list[Path] = []
     is_written = out is not None and (anyway or found.status != "inconsistent")
     if out is not None and is_written:
-        from consistency.referee.fit_covariance.fit_files import write_correction
+        from consistency.referee.fit_covariance.fit_files import write_bound_correction, write_correction
 
-        written = write_correction(found, record, texts, out, overwrite)
-    print_document(correction_document(found), as_json, written)
+        if isinstance(found, BoundCorrection):
+            written = write_bound_correction(found, out, overwrite)
+        else:
+            written = write_correction(found, record, texts, out, overwrite)
+    shown = bound_correction_document(found) if isinstance(found, BoundCorrection) else correction_document(found)
+    print_document(shown, as_json, written)
     if out is not None and not is_written:
         print(
             f"consistency: {out} is not written, as no factor mends what is wrong; --anyway writes it", file=sys.stderr

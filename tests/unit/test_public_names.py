@@ -15,8 +15,8 @@ import consistency
 ROOT = Path(__file__).parents[2]
 NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api, of the documents and of the gallery
     "consistency": """
-        Alarm Compared Control Correction Drive Finding Gaussian Info InputError Inspection Log Monitor
-        NoiseModel Observation Record Results Scenario Study Trial Tuning Verdict analyse anees anees_interval
+        Alarm BoundCorrection Compared Control Correction Drive Finding Gaussian Info InputError Inspection Log
+        Monitor NoiseModel Observation Record Results Scenario Study Trial Tuning Verdict analyse anees anees_interval
         compare correct drive_of filter_names fit_covariance get_filter guarded inspect judge load_scenario
         make_record monte_carlo nees plan read read_drives read_log read_results run_trials scenario_names simulate tune
         verdict_table""",

@@ -24,6 +24,7 @@ BETS = np.r_[0.002, 0.005, 0.01, 0.02, 0.05, np.linspace(0.1, 0.99, 19)]  # of t
 HALVINGS = 60  # of an interval: more than a double resolves
 NEAR = 1e-3  # saddle points nearer to 0 than this take the limit there
 TAIL = (1.0 - CONFIDENCE) / 2.0  # of each side of an interval
+ROUNDING = 1e-9  # of sums of shares
 LARGEST = 10**6  # runs; more are not planned
 TRIED, TEETH = 600, 8  # numbers of runs up to that, and how many of their gaps are looked through
 Test = Callable[[Array, float], Array]
@@ -141,13 +142,61 @@ class Exceedance:
         low, high = float(ends[small]), float(ends[large])
         return Interval(float(np.clip(ends[right], low, high)), low, high)
 
+    def covering_factors(self) -> tuple[float, Array]:
+        """The smallest factor that is sure to hold its level for one more run, and that without each run, (R,).
+
+        The expected share of steps of a new exchangeable run that are outside is at most ``a`` if the shares of those
+        known add up to a (N + 1) - 1 at most: the new run is counted as outside throughout (conformal risk control,
+        Angelopoulos et al. 2024). Infinite for fewer runs than :func:`fewest_fitted`. Without a run that has no step
+        it is the factor of all.
+        """
+        sizes = self.ratios
+        some = self._counts > 0
+        weight = np.where(some, 1.0 / np.maximum(self._counts, 1), 0.0)
+        there = ~np.isnan(sizes)
+        order = np.argsort(sizes[there], kind="stable")
+        at = np.r_[0.0, sizes[there][order]]
+        inside = np.r_[0.0, np.cumsum(np.broadcast_to(weight[:, None], sizes.shape)[there][order])]
+        runs = int(some.sum())
+
+        def outside(i: Indices) -> tuple[Array, Array]:
+            """Shares outside of all runs together, and of each, (R,), with one factor for each run."""
+            factor = at[i]
+            last = np.searchsorted(at, factor, side="right") - 1
+            with np.errstate(invalid="ignore"):
+                return inside[-1] - inside[last], weight * (sizes > factor[:, None]).sum(axis=1)
+
+        def least(left: Indices) -> Array:
+            """The factor of all runs, or without each; ``left`` (R,) is 0 or 1."""
+            room = self.a * (runs - left + 1) - 1.0 + ROUNDING
+            low, high = np.zeros(len(sizes), int), np.full(len(sizes), len(at) - 1)
+            while (low < high).any():
+                middle = (low + high) // 2
+                total, own = outside(middle)
+                fits = total - left * own <= room
+                high = np.where(fits, middle, high)
+                low = np.where(fits, low, np.minimum(middle + 1, high))
+            return np.where(room >= 0.0, at[high], np.inf)
+
+        return float(least(np.zeros(len(sizes), int))[0]), least(some.astype(int))
+
     def rate_limit(self, confidence: float = CONFIDENCE) -> float:
         """Rate of steps outside that the runs exclude, with all larger ones: 3 / N where N runs never leave."""
-        shares = 1.0 - self.shares()[1]
+        return self._end(1.0 - self.shares()[1], 1.0 - confidence)
+
+    def rate_interval(self, tail: float = TAIL) -> Interval:
+        """Share of steps outside, and the rates that neither side rejects."""
+        high = self._end(1.0 - self.shares()[1], tail)
+        low = 1.0 - self._end(self.shares()[0], tail)
+        rate = self.rate()
+        return Interval(rate, min(low, rate), max(high, rate))
+
+    def _end(self, shares: Array, tail: float) -> float:
+        """The smallest rate so that a mean of ``shares`` above 1 less that rate is not believed."""
         low, high = 0.0, 1.0
         for _ in range(HALVINGS // 2):
             rate = 0.5 * (low + high)
-            if rate < 1.0 and gaffke(shares, 1.0 - rate) <= 1.0 - confidence:
+            if rate < 1.0 and gaffke(shares, 1.0 - rate) <= tail:
                 high = rate
             else:
                 low = rate
@@ -192,6 +241,11 @@ class BoundRuns(NamedTuple):
 def fewest_runs(level: float, tail: float = 1.0 - CONFIDENCE) -> int:
     """Runs that may all stay inside a bound of this level with a probability of at most ``tail``: 59 at 95 %."""
     return int(np.ceil(np.log(tail) / np.log(level) - 1e-9))
+
+
+def fewest_fitted(level: float) -> int:
+    """Runs with which a factor is sure to hold this level for one more: 19 at 95 %."""
+    return int(np.ceil(1.0 / (1.0 - level) - 1.0 - ROUNDING))
 
 
 def bound_runs(

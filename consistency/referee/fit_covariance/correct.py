@@ -25,7 +25,8 @@ from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.whitening import squared_length, whiten
 from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.covariance_ratios import HALF, IN_TURN, named, shown
+from consistency.referee.fit_covariance.correct_bounds import BoundCorrection, correct_bounds
+from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, fitted_and_judged, require_fixed_groups, shown
 from consistency.referee.fit_covariance.estimation import log_densities, mean_over_runs
 from consistency.referee.fit_covariance.factors import (
     KINDS,
@@ -38,8 +39,10 @@ from consistency.referee.fit_covariance.factors import (
     stated_errors,
     steps_of_runs,
 )
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
-from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
+from consistency.referee.readers.pipeline.read_files import checked_options
+from consistency.referee.readers.pipeline.relative_motions import rows_as_declared
 from consistency.referee.system.progress import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
@@ -161,10 +164,12 @@ def correct(
     per_axis: bool = False,
     names: Sequence[str] | None = None,
     independent: bool = False,
-) -> Correction:
-    """Fit factors to the covariances that an estimator states, and judge them on runs that chose nothing.
+    bounds: ArrayLike | None = None,
+    level: str | float | Mapping[str, Any] | None = None,
+) -> Correction | BoundCorrection:
+    """Fit factors to the covariances or bounds that an estimator states, and judge them on runs that chose nothing.
 
-    Where none is stated it is I, and gets a factor for each component.
+    Where neither is stated the covariance is I, and gets a factor for each component.
 
     Parameters
     ----------
@@ -176,22 +181,41 @@ def correct(
     per_axis : a factor for each component, in place of one for position, attitude and velocity
     names : of the runs, for messages and ``held_out``; their numbers where None
     independent : errors are (N, n), or (runs, steps, n), and each row is an independent run
+    bounds, level : in place of covariances, as for :func:`consistency.judge`: the factor of a bound is one with which
+        a new run is expected to leave it in at most 1 - level of its steps
+
+    Returns
+    -------
+    Correction, or BoundCorrection of bounds
 
     Raises
     ------
     InputError
-        There is one run, or none with errors and covariances; or a name is not there.
+        There is one run, or none with errors and covariances; fewer runs than the level of a bound takes (20 at 95 %);
+        or a name is not there.
     """
-    if not isinstance(record, Record):
+    if not isinstance(record, Record) and bounds is not None:
+        if covariances is not None:
+            raise InputError("covariances, bounds: give one of them beside errors")
+        options = checked_options(make_reading(level=level))
+        record = record_of_arrays({"errors": record, "bounds": bounds}, axes, "estimator", independent, options)
+        record = rows_as_declared(record)
+    elif bounds is not None or level is not None:
+        raise InputError("bounds and level: go together, beside errors; a record has its own")
+    elif not isinstance(record, Record):
         shape = np.shape(record)
         unit = np.broadcast_to(np.eye(shape[-1] if shape else 1), (*shape, *shape[-1:]))
         given = {"errors": record, "covariances": unit if covariances is None else covariances}
         record = record_of_arrays(given, axes, "estimator", independent)
-        record = rows_as_runs(record) if independent else record
+        record = rows_as_declared(record)
         record = replace(record, errors=replace(record.errors, assumed=covariances is None))
+    labels = tuple(map(str, record.run_numbers if names is None else names))
+    if record.errors.bounds:
+        if per_axis:
+            raise InputError("--per axis: is for covariances; each bound has a factor of its own")
+        return correct_bounds(record, labels, held_out)
     require_runs(record)
     _, _, nees = stated_errors(record)
-    labels = tuple(map(str, record.run_numbers if names is None else names))
     counted = np.asarray(np.isfinite(nees).any(axis=1))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
     blocks = blocks_of(record.errors.axes, record.errors.dof, per_axis or record.errors.assumed)
@@ -245,11 +269,7 @@ def require_runs(record: Record) -> None:
     """Refuse a record that has no covariances, or one run alone."""
     if record.errors.error is None or record.errors.covariance is None or record.errors.nees is None:
         raise InputError(f"{record.name}: needs errors and covariances, of files with a truth")
-    if record.groups is not None and record.groups.outcome:
-        raise InputError(
-            f"--by {record.groups.column}: {record.groups.outcome}, which selects on the outcome: by it a right "
-            "covariance has other ratios, too, so that factors would be wrong"
-        )
+    require_fixed_groups(record)
     if record.guesses:
         raise InputError("--error guess: a correction is of one error; declare the one that the covariance is of")
     runs = int(np.isfinite(record.errors.nees).any(axis=1).sum())
@@ -263,25 +283,6 @@ def require_runs(record: Record) -> None:
         )
     if runs == 0:
         raise InputError(f"{record.name}: no run has a step with an error and a covariance of full rank")
-
-
-def fitted_and_judged(labels: Sequence[str], counted: Array, held_out: str | None) -> tuple[Indices, Indices]:
-    """Rows of the runs that are fitted, and of those that are judged, among them runs that failed from the start.
-
-    Parameters
-    ----------
-    counted : (runs,) of bool, runs with a step that can be fitted
-    """
-    every = np.arange(len(labels))
-    if held_out is None:
-        return every[counted], every
-    judged = every[len(every) // 2 :]
-    if held_out != HALF:
-        judged = named(labels, held_out, "run")
-    fitted = np.setdiff1d(every[counted], judged)
-    if len(fitted) < 2 or not counted[judged].any():
-        raise InputError(f"--held-out {held_out}: leaves {len(fitted)} runs to fit; it takes 2, and 1 to judge")
-    return fitted, judged
 
 
 def fit_groups(record: Record, blocks: tuple[FactorBlock, ...]) -> dict[str, Fit]:

@@ -161,6 +161,34 @@ def named(known: Sequence[str], held_out: str, what: str = "drive") -> Indices:
     return np.array([known.index(name) for name in names])
 
 
+def require_fixed_groups(record: Record) -> None:
+    """Refuse groups that select on the outcome."""
+    if record.groups is not None and record.groups.outcome:
+        raise InputError(
+            f"--by {record.groups.column}: {record.groups.outcome}, which selects on the outcome: by it a right "
+            "statement has other ratios, too, so that factors would be wrong"
+        )
+
+
+def fitted_and_judged(labels: Sequence[str], counted: Array, held_out: str | None) -> tuple[Indices, Indices]:
+    """Rows of the runs that are fitted, and of those that are judged, among them runs that failed from the start.
+
+    Parameters
+    ----------
+    counted : (runs,) of bool, runs with a step that can be fitted
+    """
+    every = np.arange(len(labels))
+    if held_out is None:
+        return every[counted], every
+    judged = every[len(every) // 2 :]
+    if held_out != HALF:
+        judged = named(labels, held_out, "run")
+    fitted = np.setdiff1d(every[counted], judged)
+    if len(fitted) < 2 or not counted[judged].any():
+        raise InputError(f"--held-out {held_out}: leaves {len(fitted)} runs to fit; it takes 2, and 1 to judge")
+    return fitted, judged
+
+
 def judged_by(folds: Sequence[Fold], windows: DriveWindows, general: bool) -> JudgedSpan:
     """Ratios of the windows of a span, each by the fit that it did not choose; of the whole and of each axis."""
     drives, parts = [], []

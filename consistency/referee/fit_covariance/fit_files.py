@@ -26,6 +26,12 @@ from consistency.referee.fit_covariance.correct import (
     data_of_correction,
     with_factors,
 )
+from consistency.referee.fit_covariance.correct_bounds import HEAD as HEAD_OF_BOUNDS
+from consistency.referee.fit_covariance.correct_bounds import (
+    BoundCorrection,
+    bound_correction_document,
+    data_of_bounds,
+)
 from consistency.referee.fit_covariance.covariance_ratios import write_motions
 from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.motion_windows import PIECES, ways
@@ -253,6 +259,13 @@ def write_correction(
         head += " P is I, as none is stated."
     texts = {"correction.toml": toml(head, data_of_correction(found)), "corrected_covariance.py": pasted(found)}
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
+
+
+def write_bound_correction(found: BoundCorrection, folder: Path, overwrite: bool = False) -> list[Path]:
+    """Write the factors of bounds, and a page; its files."""
+    texts = {"correction.toml": toml(f"{found.status} after: {HEAD_OF_BOUNDS}", data_of_bounds(found))}
+    kind = "bound-correction", found.name
+    return write_fit(folder, kind, texts, bound_correction_document(found), lambda at: [], overwrite)
 
 
 def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:

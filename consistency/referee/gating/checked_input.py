@@ -21,8 +21,14 @@ from consistency.referee.errors import InputError
 from consistency.referee.gating.session import Terms
 from consistency.referee.readers.formats.archives import steps_of
 from consistency.referee.readers.options import Reading, StatementOptions
-from consistency.referee.readers.pipeline.arrays_in_memory import in_memory, masked_steps, record_of_arrays
+from consistency.referee.readers.pipeline.arrays_in_memory import (
+    in_memory,
+    masked_steps,
+    record_of_arrays,
+    record_of_statement,
+)
 from consistency.referee.readers.pipeline.read_files import checked_options
+from consistency.referee.readers.pipeline.relative_motions import rows_as_declared
 from consistency.referee.readers.runs_to_record import Track, judged_rows, longest_start, symmetric
 from consistency.referee.types import Array, Failure, Indices
 from consistency.referee.verdicts.judge_sources import Source
@@ -40,7 +46,12 @@ def record_of_checked(
     deviations: ArrayLike | None = None,
     bounds: ArrayLike | None = None,
     level: str | float | Mapping[str, Any] | None = None,
+    gaussian: bool = False,
     ends: str | None = None,
+    members: ArrayLike | None = None,
+    truth: ArrayLike | str | None = None,
+    ensemble: int | None = None,
+    independent: bool = False,
     nees: ArrayLike | None = None,
     dof: ArrayLike | None = None,
     nis: ArrayLike | None = None,
@@ -59,30 +70,36 @@ def record_of_checked(
         raise ValueError(f"give {' or '.join(there)}, not both")
     key = there[0] if there else "covariances"
     size = sizes[key]
-    options = Reading(statement=StatementOptions(level=level, ends=ends))
-    if options.given() and bounds is None:
+    options = Reading(statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble))
+    if options.given(("level", "ends")) and bounds is None and not gaussian:
         raise ValueError("level and ends go with bounds")
     if errors is None and size is not None:
         raise ValueError(f"{key} without errors: give both")
-    if errors is not None and size is None:
+    if errors is not None and size is None and members is None:
         raise ValueError("errors without covariances: give both")
     if errors is not None and nees is not None:
         raise ValueError("give errors and covariances, or nees and dof, not both")
     if nees is not None and dof is None:
         raise ValueError("nees without dof: give dof, the dimension of the error")
     for option, value in (("axes", axes), ("subsets", subsets)):
-        if value is not None and errors is None:
+        if value is not None and errors is None and (option == "subsets" or members is None):
             raise ValueError(f"{option} needs errors and covariances: the nees does not know its components")
     if subsets is not None and deviations is not None:
         raise ValueError("subsets needs covariances: of deviations each component is judged by itself")
     record = Record(name)
-    given = {"errors": errors, key: size, "nees": nees}
-    if nees is not None:
-        given["dof"] = dof
-    stated = {key: value for key, value in given.items() if value is not None}
-    if stated:
-        record = record_of_arrays(stated, axes, name, reading=checked_options(options))
-        if nees is None and dof is not None and dof != record.errors.dof:
+    stated = nees is not None or errors is not None or members is not None or truth is not None
+    of_vectors = {"members": members, "truth": truth, "ensemble": ensemble, "independent": independent or None}
+    lost = [option for option, value in of_vectors.items() if value is not None]
+    if lost and (nees is not None or not stated):
+        raise ValueError(f"{', '.join(lost)}: needs errors; NEES, NIS and innovations do not have them")
+    if nees is not None and dof is not None:
+        record = record_of_arrays({"nees": nees, "dof": dof}, axes, name)
+    elif stated:
+        of_errors: dict[str, ArrayLike] = {} if size is None else {key: size}
+        reading = checked_options(options)
+        record = record_of_statement(errors, of_errors, members, truth, axes, name, independent, reading)
+        record = rows_as_declared(record)
+        if dof is not None and dof != record.errors.dof:
             raise ValueError(f"dof is {dof}, but the errors have {record.errors.dof} components")
     of_gain, failures = _innovations(name, nis, nis_dof, innovations, innovation_covariances, _gone(record))
     if not stated and of_gain.nis is None:
@@ -104,6 +121,16 @@ def bound_gate_runs(record: Record, terms: Terms) -> int:
     from consistency.referee.diagnostics.exceedance import LARGEST, runs_to_show
 
     return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
+
+
+def planned_detect(record: Record, detect: float) -> float:
+    """The ratio of mean squares to plan for: of ranks and members it is nearer to 1 than that of the covariance."""
+    tables = [table for part in record.errors.parts or (None,) if (table := record.table(part)) is not None]
+    if not tables:
+        return detect
+    shown = min(table.factor(max(detect, 1.0 / detect)) for table in tables)
+    shown = max(np.floor(1000.0 * shown), 1001.0) / 1000.0
+    return float(shown if detect > 1.0 else 1.0 / shown)
 
 
 def planned_dof(record: Record) -> int:
@@ -144,6 +171,24 @@ def record_of_filter(
         filter_name = results.filters[0]
     record = results.record(filter_name).without_first(skip_of(skip))
     return replace(record.errors_alone, name=name or filter_name)
+
+
+def record_of_read(
+    record: Record, name: str | None, optimal_gain: bool = False, skip: str | float | Skip | None = None
+) -> Record:
+    """Return a record of :func:`consistency.read` as a gate judges it.
+
+    Raises
+    ------
+    ValueError
+        ``skip`` leaves nothing.
+    """
+    try:
+        record = rows_as_declared(record).without_first(skip_of(skip))
+    except InputError as error:
+        raise ValueError(str(error).removeprefix("--")) from None
+    record = record.with_optimal_gain() if optimal_gain else record
+    return replace(record, name=name or record.name)
 
 
 # --- arrays ----------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.comparison import Comparison
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Reason, Status, Table, fragment, table
-from consistency.referee.gating.checked_input import planned_dof, rate_shares
+from consistency.referee.gating.checked_input import planned_detect, planned_dof, rate_shares
 from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
 from consistency.referee.show import rendered
 from consistency.referee.system.stopping import write_whole
@@ -85,6 +85,7 @@ def entry_of(
         false_alarm=demand.false_alarm, in_budget=demand.budget is not None,
         in_place=in_place,
         runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
+        planned_detect=planned_detect(record, demand.detect),
         detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
         **fields,
     )  # fmt: skip

@@ -80,6 +80,7 @@ class Entry:
     inflation: float | None = None
     inflation_interval: list[float | None] = field(default_factory=list)
     parts: int = 1  # that share the false-alarm rate: components whose cross terms are not stated
+    planned_detect: float | None = None  # that plans the runs, where ranks among members show less; None: ``detect``
     axis: str | None = None  # that decides the status; None where the whole does
     axis_ratio: list[float | None] = field(default_factory=list)
     first_step: int | None = None
@@ -330,7 +331,8 @@ def needed_at(entry: Entry, rate: float) -> int:
     if not entry.dof:  # of bounds, whose number does not depend on the rate
         return entry.needed
     if entry.standard_error is None:
-        return gate_runs(entry.dof, entry.detect, rate / entry.parts, entry.power, entry.allow, entry.lost)
+        detect = entry.planned_detect or entry.detect
+        return gate_runs(entry.dof, detect, rate / entry.parts, entry.power, entry.allow, entry.lost)
     comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)
     return comparison.needed_runs(entry.detect, entry.power)
 

@@ -21,7 +21,6 @@ from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.formats.archives import UNWEIGHTED
 from consistency.referee.readers.options import (
     OPTIONS,
-    REPEATS,
     ComponentOptions,
     ConventionOptions,
     GroupOptions,
@@ -33,7 +32,7 @@ from consistency.referee.readers.options import (
     TruthOptions,
     make_reading,
 )
-from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
+from consistency.referee.readers.pipeline.arrays_in_memory import record_of_statement
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
@@ -280,21 +279,14 @@ def judge(
     options = Reading(statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble))
     if bounds is not None or options.given(("level", "gaussian", "ends")):
         options = checked_options(options)
-    if members is not None:
-        if truth is None or isinstance(truth, str) or record is not None or stated:
-            raise InputError("members: need truth=, (runs, steps, n), beside them, and nothing else")
-        record = record_of_arrays({"members": members, "truth": truth}, axes, name, independent, options)
-    elif truth is not None:
-        if not isinstance(truth, str) or truth != REPEATS or not stated:
-            raise InputError("truth: goes with members=; or is 'repeats', beside estimates with covariances")
-        given_estimates = {"estimates": cast(ArrayLike, record), **stated}
-        record = record_of_arrays(given_estimates, axes, name, independent, options)
-    elif stated:
-        stated |= {} if truth_covariances is None else {"truth_covariances": truth_covariances}
-        record = record_of_arrays({"errors": cast(ArrayLike, record), **stated}, axes, name, independent, options)
-        options = Reading(truth=TruthOptions(truth_errors=truth_errors, truth_shared=truth_shared or None))
-        require_truth_options(options)
-        (record,) = declared([record], options)
+    if stated or members is not None or truth is not None:
+        of_truth = {} if truth_covariances is None or truth is not None else {"truth_covariances": truth_covariances}
+        errors = cast("ArrayLike | None", record)
+        record = record_of_statement(errors, stated | of_truth, members, truth, axes, name, independent, options)
+        if truth is None:
+            options = Reading(truth=TruthOptions(truth_errors=truth_errors, truth_shared=truth_shared or None))
+            require_truth_options(options)
+            (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
         record = read(record, independent=independent, level=level, gaussian=gaussian, ends=ends)
     elif not isinstance(record, Record):
@@ -303,10 +295,10 @@ def judge(
         raise InputError("independent: is for errors and paths; of a record, give independent=True to consistency.read")
     if by is not None or bins is not None:
         record = with_groups(record, by, bins)
-    if record.runs.independent and record.origin.window is None:
-        from consistency.referee.readers.pipeline.relative_motions import rows_as_runs
+    if record.runs.independent:
+        from consistency.referee.readers.pipeline.relative_motions import rows_as_declared
 
-        record = rows_as_runs(record)
+        record = rows_as_declared(record)
     record = record.without_first(skip_asked(skip))
     if optimal_gain:
         record = record.with_optimal_gain()

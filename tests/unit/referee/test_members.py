@@ -16,9 +16,12 @@ from consistency.referee.diagnostics.normal_numbers import (
     step_down_numbers,
     step_down_tables,
 )
+from consistency.referee.diagnostics.number_of_runs import gate_runs
+from consistency.referee.gating.checked_input import planned_detect
 from consistency.referee.pages.record_figures import rank_shares, record_figures
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
+from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent
 
 RARE = 1e-5
 ROOT = np.linalg.cholesky(np.full((3, 3), 0.6) + 0.4 * np.eye(3)).T
@@ -418,3 +421,71 @@ def test_trajectories_are_not_repeats(tmp_path, monkeypatch):
     (tmp_path / "est.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match=r"repeats.*est\.tum"):
         cs.read("est.tum", truth="repeats")
+
+
+# --- gates -------------------------------------------------------------------------------------------
+
+
+def unit(runs, n=3):
+    return np.random.default_rng(31).standard_normal((runs, n)), np.broadcast_to(np.eye(n), (runs, n, n))
+
+
+def test_gates_take_members_and_plan_for_what_they_show():
+    truth, members = drawn(28, 20, 300)
+    verdict = assert_consistent(members=members, truth=truth, axes=["x", "y", "z"], false_alarm=RARE)
+    judged = cs.judge(members=members, truth=truth, axes=["x", "y", "z"], false_alarm=RARE)
+    assert (verdict.p_value, verdict.inflation) == (judged.p_value, judged.inflation)
+    with pytest.raises(ConsistencyError, match="overconfident"):
+        assert_consistent(members=members, truth=2 * truth)
+    with pytest.raises(InsufficientTrials, match=r"--dof 1 --detect 1\.318 --false-alarm 2e-06") as few:
+        assert_consistent(members=members[:20], truth=truth[:20], false_alarm=4 * 2e-6)
+    assert 1.318 <= min(table.factor(1.5) for table in rank_tables(20, 3)) <= 1.319
+    assert few.value.needed >= gate_runs(1, 1.318, 2e-6)
+    assert planned_detect(judged.record, 1 / 1.5) == pytest.approx(1 / 1.318)
+    assert planned_detect(judged.record, 1.0001) == 1.001
+
+
+def test_gates_take_the_mean_and_covariance_of_members_repeats_and_rows():
+    truth, members = drawn(29, 10, 400)
+    e, P = mean_and_covariance(truth, members)
+    assert assert_consistent(e, P, ensemble=10, false_alarm=RARE).consistent
+    with pytest.raises(ConsistencyError, match="overconfident"):
+        assert_consistent(e, P)
+    x, cov = unit(300)
+    assert assert_consistent(x, cov, independent=True, false_alarm=RARE).unit == "row"
+    assert assert_consistent(x + 7.0, cov, truth="repeats", independent=True, false_alarm=RARE).runs == 299
+    wide = stats.norm.ppf(0.975) * np.ones((300, 1, 3))
+    assert assert_consistent(x[:, None], deviations=wide, level="95%", gaussian=True, false_alarm=RARE).consistent
+
+
+def test_gates_take_records_of_files(tmp_path):
+    x, cov = unit(300)
+    np.savez(tmp_path / "rows.npz", errors=x[None], covariances=cov[None])
+    record = cs.read(tmp_path / "rows.npz", independent=True)
+    verdict = assert_consistent(record, false_alarm=RARE, name="mine")
+    assert (verdict.runs, verdict.filter) == (300, "mine")
+    assert assert_consistent(record, false_alarm=RARE).filter == "rows"
+    with pytest.raises(ConsistencyError, match="overconfident"):
+        assert_consistent(cs.judge(2 * x, cov, independent=True).record)
+    with pytest.raises(ValueError, match="covariances: a record"):
+        assert_consistent(record, cov)
+    with pytest.raises(ValueError, match="skip"):
+        assert_consistent(record, skip=1)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"members": np.ones((3, 2, 4, 1))}, "members: need truth="),
+        ({"members": np.ones((3, 2, 4, 1)), "truth": np.ones((3, 2, 1)), "errors": np.ones((3, 2, 1))}, "nothing else"),
+        ({"truth": "repeats"}, "truth: goes with members"),
+        ({"nees": np.ones((3, 2)), "dof": 2, "ensemble": 9}, "ensemble: needs errors"),
+        (
+            {"nis": np.ones((3, 2)), "nis_dof": 2, "optimal_gain": True, "independent": True},
+            "independent: needs errors",
+        ),
+    ],
+)
+def test_gates_refuse_what_does_not_go_together(given, message):
+    with pytest.raises(ValueError, match=message):
+        assert_consistent(**given)

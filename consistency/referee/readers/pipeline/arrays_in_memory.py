@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,10 +18,41 @@ from consistency.referee.diagnostics.whitening import diagonal
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import require_name
 from consistency.referee.readers.formats.archives import estimator_of_arrays, first_known, require_layout
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import REPEATS, Reading
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.truth_matching import Estimator
 from consistency.referee.types import Array, Indices
+
+
+def record_of_statement(
+    errors: ArrayLike | None,
+    stated: Mapping[str, ArrayLike],
+    members: ArrayLike | None,
+    truth: ArrayLike | str | None,
+    axes: Sequence[str] | None,
+    name: str,
+    independent: bool,
+    reading: Reading,
+) -> Record:
+    """Errors beside what is ``stated`` of them, members with their truth, or repeats, as a record.
+
+    Raises
+    ------
+    InputError
+        Arguments that do not go together, and as :func:`record_of_arrays`.
+    """
+    given: dict[str, ArrayLike]
+    if members is not None:
+        if truth is None or isinstance(truth, str) or errors is not None or stated:
+            raise InputError("members: need truth=, (runs, steps, n), beside them, and nothing else")
+        given = {"members": members, "truth": truth}
+    elif truth is None:
+        given = {"errors": cast(ArrayLike, errors), **stated}
+    elif isinstance(truth, str) and truth == REPEATS and stated and errors is not None:
+        given = {"estimates": errors, **stated}
+    else:
+        raise InputError("truth: goes with members=; or is 'repeats', beside estimates with covariances")
+    return record_of_arrays(given, axes, name, independent, reading)
 
 
 def record_of_arrays(

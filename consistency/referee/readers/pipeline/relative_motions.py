@@ -242,6 +242,11 @@ def _widest(found: Sequence[Windows]) -> float:
     return float(np.median(np.sqrt(np.maximum(largest, 0.0))))
 
 
+def rows_as_declared(record: Record) -> Record:
+    """The record, with each row a run where rows are declared to be independent and no window was asked for."""
+    return rows_as_runs(record) if record.runs.independent and record.origin.window is None else record
+
+
 def rows_as_runs(record: Record) -> Record:
     """The record with each row a run, as ``--independent`` declares, noted where neighbours seem to be dependent."""
     note = f"{record.name}: errors of different rows are declared to be independent: each is a run"

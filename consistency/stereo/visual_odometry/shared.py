@@ -94,7 +94,7 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    return uncertain_truth.fit_shared(errors, J, S, np.array(list(SHARED.values())))
+    return uncertain_truth.fit_shared_error(errors, J, S, np.array(list(SHARED.values())))
 
 
 def _twist(pose: RelativePose) -> Array:

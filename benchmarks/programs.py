@@ -30,7 +30,7 @@ from script_options import options_of
 
 import consistency as cs
 from consistency.referee.programs.process import program_of
-from consistency.referee.programs.study import Plan, run_study
+from consistency.referee.programs.study import ProgramPlan, run_study
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.program_runs import ProgramRuns
 from consistency.referee.system.progress import quiet
@@ -97,7 +97,7 @@ def time_for_a_run(runs: int) -> None:
     ProgramRuns.estimators = timed(ProgramRuns.estimators, "merging")  # type: ignore[method-assign]
     before = resource.getrusage(resource.RUSAGE_SELF)
     with tempfile.TemporaryDirectory() as place:
-        plan = Plan(runs, jobs=1)
+        plan = ProgramPlan(runs, jobs=1)
         run_study(program_of(COPY, Path.cwd()), plan, Path(place) / "out", reading=make_reading(state=STATE))
     after = resource.getrusage(resource.RUSAGE_SELF)
     whole = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

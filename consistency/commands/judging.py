@@ -179,9 +179,9 @@ def inspect_command(
     as_json: AsJson = False,
 ) -> None:
     """Show what a file holds, and the command that judges it."""
-    from consistency.referee.verdicts.inspect_sources import inspect, inspection_document
+    from consistency.referee.verdicts.inspect_sources import inspect_files, inspection_document
 
-    found = inspect(path, files)
+    found = inspect_files(path, files)
     print_document(inspection_document(found), as_json)
     if found.missing:
         raise InputError(found.missing)
@@ -270,8 +270,7 @@ def plan_command(
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
     from consistency.referee.document.tables import bound_plan_lines, plan_lines
-    from consistency.referee.verdicts.judge_sources import pilots_of_records, plan_of_bounds
-    from consistency.referee.verdicts.judge_sources import plan as plan_runs
+    from consistency.referee.verdicts.judge_sources import pilots_of_records, plan_of_bounds, plan_runs
 
     if level is not None:
         if scenario is not None or like is not None or lost is not None or groups is not None or allow is not None:
@@ -457,9 +456,9 @@ def monitor_command(
     from consistency.referee.verdicts.monitor_sources import (
         make_monitor,
         refuse_bags,
+        skip_first,
         watch,
         watch_lines,
-        without_first,
     )
 
     require_word("--fail-on", fail_on, "alarm")
@@ -480,7 +479,7 @@ def monitor_command(
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, partial(print, file=sys.stderr, flush=True), files)
     else:
-        log = without_first(_read_innovations(Path(path), filter_name, run, files), first)
+        log = skip_first(_read_innovations(Path(path), filter_name, run, files), first)
         tell(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)

@@ -30,7 +30,7 @@ def require_reports(report: Path | None, junit: Path | None, overwrite: bool) ->
             require_report(path, overwrite)
 
 
-def write_reports(
+def write_verdicts(
     records: Sequence[Record],
     verdicts: Mapping[str, Verdict],
     document: Document,

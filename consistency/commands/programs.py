@@ -82,10 +82,10 @@ def monte_carlo_command(
     replaced. Each run has a folder of its own in --out, {out}, where the program is started; {here} is the folder of
     the call. The program writes estimates and truth there, as 'analyse' reads them.
     """
-    from consistency.commands.program_reports import require_reports, write_reports
+    from consistency.commands.program_reports import require_reports, write_verdicts
     from consistency.referee.document.tables import document
     from consistency.referee.programs.process import inputs_of, program_of
-    from consistency.referee.programs.study import Plan, run_study
+    from consistency.referee.programs.study import ProgramPlan, run_study
     from consistency.referee.readers.pipeline.program_runs import failures_in_words
     from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
@@ -97,7 +97,7 @@ def monte_carlo_command(
         hint = f"; if it is one of the files of --each, quote the pattern: --each '{each}'"
     program = program_of(command, here, cwd, hint)
     inputs = () if each is None else inputs_of(each, here)
-    plan = Plan(
+    plan = ProgramPlan(
         runs, until_decided, max_runs, seed, jobs, timeout, check_seed, keep, inputs, settings, skip_asked(skip),
         innovations is not None,
     )  # fmt: skip
@@ -108,7 +108,7 @@ def monte_carlo_command(
     shown = document(verdicts, program.name)
     print_document(shown, as_json)
     sys.stdout.flush()  # whatever becomes of the pictures
-    written = write_reports(records, verdicts, shown, report, junit, overwrite)
+    written = write_verdicts(records, verdicts, shown, report, junit, overwrite)
     if not as_json:
         for file in written:
             print(file)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.nees import e_processes, ever
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.sentences import details, other_ways, reasons, sentences_of_conventions
@@ -310,7 +310,7 @@ def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float
 def _inspected(design: Design, evidence: Record, spent: float | None) -> Findings:
     """Findings of an inspection."""
     p_values = _p_of_scale(design, evidence)
-    return findings_of(evidence, design.settings, Inspection(spent, max(p_values), p_values[0]))
+    return findings_of(evidence, design.settings, InterimLook(spent, max(p_values), p_values[0]))
 
 
 def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept: Record | None = None) -> Verdict:

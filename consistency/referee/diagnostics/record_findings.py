@@ -75,7 +75,7 @@ INNOVATIONS = "innovations"
 
 
 @dataclass(frozen=True)
-class Inspection:
+class InterimLook:
     """One of several looks at growing evidence; see :mod:`consistency.referee.diagnostics.planning`."""
 
     spent: float | None  # part of the false-alarm rate of every question but the scale that this look may cost;
@@ -99,7 +99,7 @@ class Inspection:
 def findings_of(
     record: Record,
     settings: Settings,
-    inspection: Inspection | None = None,
+    inspection: InterimLook | None = None,
     truth: UncertainTruth | None = None,
     unshown: str = "",
 ) -> Findings:
@@ -276,7 +276,7 @@ def _tolerated(joint: JointTest | None, innovations: Innovations | None, setting
 
 
 def _equivalence(
-    sample: Sample, settings: Settings, inspection: Inspection | None, record: Record, truth: UncertainTruth | None
+    sample: Sample, settings: Settings, inspection: InterimLook | None, record: Record, truth: UncertainTruth | None
 ) -> Equivalence:
     """Whether the ratio of true to stated covariance is shown to lie where it should.
 

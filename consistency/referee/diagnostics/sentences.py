@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.number_words import (
 )
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.sample import ATTITUDE, POSITION
-from consistency.referee.diagnostics.status import clear
+from consistency.referee.diagnostics.status import axis_at_fault
 from consistency.referee.diagnostics.verdict import UNKNOWN_ENDS, ConventionResult, Findings, Verdict
 from consistency.referee.diagnostics.verdict_parts import (
     SCALE,
@@ -209,7 +209,7 @@ def _no_fault(v: Findings, s: Scale) -> str:
         none = "no fault beyond the tolerance"
     if v.parts:
         size = "covariance ratio of every part"
-    worst = clear(v.worst_axis)
+    worst = axis_at_fault(v.worst_axis)
     if worst is not None:
         axis = f" (worst axis: {worst[0]}, {ratio_text(worst[1])})"
     if v.by_group is not None or v.parts:
@@ -320,7 +320,7 @@ def _levels(v: Findings, s: Scale) -> list[str]:
         lines.append(_level(v, s, v.location))
     if not v.faults:
         lines += _two_intervals(s, v.unit)
-    worst = clear(v.worst_axis)
+    worst = axis_at_fault(v.worst_axis)
     of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
         where = since_text(v)

@@ -130,7 +130,7 @@ def deciding_axis(found: Findings) -> tuple[str, Interval] | None:
     It is the worst one where an axis is found at fault and the whole is not, or errs in the other direction, or looks
     right: its ratio lies in [1 / detect, detect], and the interval of the axis outside.
     """
-    axis = clear(found.worst_axis)
+    axis = axis_at_fault(found.worst_axis)
     factor = found.settings.factor
     faults = found.faults
     if found.parts:
@@ -148,7 +148,7 @@ def deciding_axis(found: Findings) -> tuple[str, Interval] | None:
     return None
 
 
-def clear(axis: tuple[str, Interval] | None) -> tuple[str, Interval] | None:
+def axis_at_fault(axis: tuple[str, Interval] | None) -> tuple[str, Interval] | None:
     """An axis whose interval does not hold 1, or None."""
     if axis is None or axis[1].holds(1.0):
         return None

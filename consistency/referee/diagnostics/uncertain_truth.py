@@ -419,7 +419,7 @@ class SharedError:
         return J @ self.mean, S + shared + np.diag(self.floor**2)
 
 
-def fit_shared(errors: Array, J: Array, S: Array, prior: Array) -> SharedError:
+def fit_shared_error(errors: Array, J: Array, S: Array, prior: Array) -> SharedError:
     """Shared errors and floor of highest likelihood.
 
     Parameters

@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.number_words import (
     with_subject,
 )
 from consistency.referee.diagnostics.sentences import question_text
-from consistency.referee.diagnostics.status import clear
+from consistency.referee.diagnostics.status import axis_at_fault
 from consistency.referee.diagnostics.verdict import MapScore, Verdict
 from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
 from consistency.referee.document.blocks import (
@@ -91,7 +91,7 @@ def columns(view: Iterable[Measure]) -> tuple[Column, ...]:
     return tuple(measure.column for measure in view)
 
 
-def with_values(view: Sequence[Measure], verdicts: Sequence[Verdict]) -> tuple[Measure, ...]:
+def known_measures(view: Sequence[Measure], verdicts: Sequence[Verdict]) -> tuple[Measure, ...]:
     """The measures that any of the verdicts has a value of."""
 
     def has_value(cell: Cell) -> bool:
@@ -159,7 +159,7 @@ def _coverage(v: Verdict) -> Cell:
 
 
 def _worst_axis(v: Verdict) -> Cell:
-    worst = clear(v.worst_axis)
+    worst = axis_at_fault(v.worst_axis)
     return NONE if worst is None else f"{worst[0]}, {ratio_text(worst[1])}"
 
 
@@ -241,7 +241,7 @@ def reason(v: Verdict, name: str = "", look: Look | None = None, verbose: bool =
 # --- one verdict ------------------------------------------------------------------------------------
 
 
-def summary(v: Verdict) -> tuple[Block, ...]:
+def summary_blocks(v: Verdict) -> tuple[Block, ...]:
     """The sentence and the figures that matter."""
     return Reasons((replace(reason(v), others=v.causes),)), Facts(tuple(rows(v)))
 
@@ -260,7 +260,7 @@ def rows(v: Verdict) -> list[tuple[str, str]]:
         rows.append(("covariance ratio", ratio))
         if v.axis is not None:
             rows.append(("decided by", f"{v.axis[0]}, {ratio_text(v.axis[1])}"))
-        elif (worst := clear(v.worst_axis)) is not None:
+        elif (worst := axis_at_fault(v.worst_axis)) is not None:
             rows.append(("worst axis", f"{worst[0]}, {ratio_text(worst[1])}"))
         if s.within is not None:
             rows.append(("within the log", f"{ratio_text(s.within.ratio)}, if errors decorrelate as within it"))
@@ -332,7 +332,7 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
     if errors := list(dict.fromkeys(v.convention for v in verdicts.values() if v.world is not None and v.convention)):
         texts = "; ".join(f"{error}: {PLANAR[error]}" for error in (*errors, ADDITIVE))
         lines.append(f"error {texts}. Each filter is judged in its own; RMSE is of position and heading in the world.")
-    worst = {name: axis for name, v in verdicts.items() if (axis := clear(v.worst_axis)) is not None}
+    worst = {name: axis for name, v in verdicts.items() if (axis := axis_at_fault(v.worst_axis)) is not None}
     if worst and len(verdicts) > 1:  # the reasons of a single verdict have it
         texts = "; ".join(f"{name} {axis}, {ratio_text(ratio)}" for name, (axis, ratio) in worst.items())
         lines.append(f"ratio of the worst axis: {texts}")

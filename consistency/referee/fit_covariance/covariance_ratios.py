@@ -26,7 +26,7 @@ from consistency.referee.readers.pipeline.relative_motions import relative_recor
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.runs_to_record import Relative
 from consistency.referee.readers.truth_matching import Poses, make_poses
-from consistency.referee.system.progress import counted
+from consistency.referee.system.progress import with_progress
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH
@@ -133,7 +133,7 @@ def folds_of(
             raise InputError(f"--held-out {held_out}: leaves no window to {'fit' if is_judged.all() else 'judge'}")
         since = [np.where(np.isin(every, judged), 0, NEVER)]
     folds = []
-    for each in counted(since, "fitting", "fits"):
+    for each in with_progress(since, "fitting", "fits"):
         is_fitted = windows.last <= each[windows.drive]
         folds.append(Fold(fit(windows.of(is_fitted)), each))
     if held_out in (None, HALF):

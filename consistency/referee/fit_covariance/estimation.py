@@ -25,14 +25,14 @@ class Score(NamedTuple):
     information: Array  # (p, p), expected
 
 
-def solved(A: Array, b: Array) -> Array:
+def solve_each(A: Array, b: Array) -> Array:
     """x of A x = b, of matrices A (..., n, n) and vectors b (..., n)."""
     return np.linalg.solve(A, b[..., None])[..., 0]
 
 
 def nees_of(error: Array, C: Array) -> Array:
     """e' C^-1 e of errors (K, n) and covariances (K, n, n), (K,)."""
-    return np.asarray((error * solved(C, error)).sum(axis=1))
+    return np.asarray((error * solve_each(C, error)).sum(axis=1))
 
 
 def log_densities(error: Array, C: Array) -> Array:

@@ -29,7 +29,7 @@ from consistency.referee.fit_covariance.estimation import (
     mean_over_runs,
     nonnegative,
     score_of,
-    solved,
+    solve_each,
 )
 from consistency.referee.types import Array, Indices
 
@@ -245,7 +245,7 @@ def fit_factors(Q: Array, sizes: Array) -> Array:
     for _ in range(ROUNDS):
         scaled = Q * x[..., :, None] * x[..., None, :]
         gradient = scaled.sum(axis=-1) - sizes
-        step = solved(scaled + np.diag(sizes), gradient)
+        step = solve_each(scaled + np.diag(sizes), gradient)
         squared = (step * gradient).sum(axis=-1, keepdims=True)
         decrement = np.sqrt(np.maximum(squared, 0.0))
         x = x * (1.0 - step / np.where(decrement < FAR, 1.0, 1.0 + decrement))
@@ -304,7 +304,7 @@ def fit_with_floors(record: Record, alone: Fit, free: Indices) -> Fit:
     _, g, H = scores(record, blocks, free, theta)
     others_g, others_H = g.sum(axis=0) - g, H.sum(axis=0) - H  # of all runs but one
     open_value = theta + np.linalg.solve(H.sum(axis=0), g.sum(axis=0))  # which may lie below 0
-    open_left_out = theta + solved(others_H, others_g)
+    open_left_out = theta + solve_each(others_H, others_g)
     targets = zip(others_H, others_g + others_H @ theta, strict=True)
     left_out = [with_parameters(blocks, free, np.maximum(nonnegative(*target), least)) for target in targets]
     runs = effective_number(run_weights(record))

@@ -139,7 +139,7 @@ def cut_windows(
         ends = _ends(first, last, pieces)
         estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:], planar)
         true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:], planar)
-        true = matrices_of(motions_between(drive.truth, first, last, planar))
+        true = motion_matrices(motions_between(drive.truth, first, last, planar))
         parts.append((np.full(len(first), number), first, last, estimated, true, true_pieces))
         long += left_out
     if not parts:
@@ -181,7 +181,7 @@ def _moves(of: DriveWindows) -> Array:
 
 def _jumps(of: DriveWindows) -> Array:
     """Which windows have a piece whose error, of position or rotation, is a jump in its drive, (W,)."""
-    gaps = inverse(matrices_of(of.pieces)) @ matrices_of(of.true_pieces)
+    gaps = inverse(motion_matrices(of.pieces)) @ motion_matrices(of.true_pieces)
     W, P, size, _ = gaps.shape
     errors = log(gaps.reshape(W * P, size, size)).reshape(W, P, -1)
     ends = _ends(of.first, of.last, P)
@@ -220,10 +220,10 @@ def motions_between(
 def in_plane(T: Array) -> Array:
     """Motions in space (..., 4, 4) as those of x, y and yaw, (..., 3, 3); yaw is the direction of the x axis."""
     yaw = np.arctan2(T[..., 1, 0], T[..., 0, 0])
-    return matrices_of(np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1))
+    return motion_matrices(np.concatenate([T[..., :2, 3], yaw[..., None]], axis=-1))
 
 
-def matrices_of(motions: Array) -> Array:
+def motion_matrices(motions: Array) -> Array:
     """Homogeneous matrices (..., d + 1, d + 1) of motions (..., n)."""
     flat = motions.reshape(-1, motions.shape[-1])
     if flat.shape[1] == 6 and len(flat):
@@ -267,7 +267,7 @@ def turn_per_way(motions: Array) -> Array:
 
 def rests(pieces: Array) -> Array:
     """Motion from the beginning of each piece to the end of its window, (W, P, n) -> (W, P + 1, d + 1, d + 1)."""
-    T = matrices_of(pieces)
+    T = motion_matrices(pieces)
     W, P, size, _ = T.shape
     out = np.empty((W, P + 1, size, size))
     out[:, P] = np.eye(size)
@@ -294,7 +294,7 @@ def root_mean_square(errors: Array) -> Array:
     return np.maximum(np.sqrt(mean_square(errors)), 1e-150)
 
 
-def blocks_of(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
+def jackknife_blocks(drive: Indices, enough: int = ENOUGH) -> list[Indices]:
     """Windows (W,) in blocks for the jackknife: drives where they are enough, otherwise consecutive windows."""
     names = np.unique(drive)
     if len(names) >= enough:

@@ -38,7 +38,7 @@ from consistency.referee.fit_covariance.motion_windows import (
     PIECES,
     DriveWindows,
     cut_windows,
-    matrices_of,
+    motion_matrices,
     span_of,
     vectors_of,
 )
@@ -121,7 +121,7 @@ class NoiseModel:
 
     def correct(self, motions: ArrayLike) -> Array:
         """Estimated motions (K, 3) or (K, 7) with the mean error taken out, as matrices (K, d + 1, d + 1)."""
-        return matrices_of(self.noise.mean.corrected(_motions(motions, self.noise)))
+        return motion_matrices(self.noise.mean.corrected(_motions(motions, self.noise)))
 
     def covariance(self, motion: ArrayLike) -> Array:
         """Covariance (n, n) of Log(D^-1 M) of a corrected motion D: the error in the body's frame at its end.
@@ -137,7 +137,7 @@ class NoiseModel:
         """
         steps = _motions(motion, self.noise)
         if len(steps) == 1:
-            steps = evenly(steps[0], PIECES)
+            steps = equal_pieces(steps[0], PIECES)
         return np.asarray(self.noise.covariance(steps[None])[0])
 
     def error_windows(self, judged: JudgedSpan) -> DriveWindows:
@@ -278,9 +278,9 @@ def caution(ratio: Ratio, probability: float) -> float:
     return float(max(1.0, ratio.value * np.exp(reach)))
 
 
-def evenly(motion: Array, pieces: int) -> Array:
+def equal_pieces(motion: Array, pieces: int) -> Array:
     """Divide a motion (n,) into equal pieces of one screw, (pieces, n)."""
-    T = matrices_of(motion[None])
+    T = motion_matrices(motion[None])
     twist = log(T)[0] / pieces
     d = len(T[0]) - 1
     turn = np.zeros(3)

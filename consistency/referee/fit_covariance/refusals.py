@@ -21,8 +21,8 @@ from consistency.referee.fit_covariance.motion_windows import (
     STILL,
     DriveWindows,
     angles,
-    matrices_of,
     mean_square,
+    motion_matrices,
     motions_between,
     norms,
     root_mean_square,
@@ -530,7 +530,7 @@ def errors_of_second(noise: WhiteNoise, windows: DriveWindows, second: Sequence[
         estimated = motions_between(twin.estimate, start[both], end[both], planar=windows.d == 2)
         if estimated.shape[1] != len(windows.axes):
             raise InputError("--second: needs poses of the same kind, in the plane or in space")
-        errors = log(inverse(matrices_of(estimated)) @ windows.true[rows[both]])
+        errors = log(inverse(motion_matrices(estimated)) @ windows.true[rows[both]])
         first.append(corrected[rows[both]])
         other.append(errors - errors.mean(axis=0) if len(errors) else errors)
     a, b = np.concatenate(first), np.concatenate(other)

@@ -12,10 +12,10 @@ from consistency.referee.fit_covariance.estimation import student
 from consistency.referee.fit_covariance.motion_windows import (
     BLOCKS,
     DriveWindows,
-    blocks_of,
     d_of,
-    matrices_of,
+    jackknife_blocks,
     mean_square,
+    motion_matrices,
     rests,
     root_mean_square,
     turn_per_way,
@@ -222,7 +222,7 @@ def estimate(
     inverse_of_sum = scaled_inverse(A.sum(axis=0), WEAK**2)
     step[free] = inverse_of_sum @ left.sum(axis=0)
     left = left - A @ step[free]
-    blocks = blocks_of(windows.drive, BLOCKS)
+    blocks = jackknife_blocks(windows.drive, BLOCKS)
     k = max(len(blocks), 2)
     sums = np.stack([left[block].sum(axis=0) for block in blocks], axis=1)
     squares = np.zeros(len(step))
@@ -328,7 +328,7 @@ def jacobian(pieces: Array) -> Array:
     d = d_of(pieces)
     axes = pieces.shape[-1] - d
     way = ways(pieces)
-    along = -inverse(matrices_of(pieces))[..., :-1, -1]  # R' t: at its end a longer way is an error along it
+    along = -inverse(motion_matrices(pieces))[..., :-1, -1]  # R' t: at its end a longer way is an error along it
     local = np.zeros((*pieces.shape, SCALES + axes + 1))
     local[..., :d, 0] = along
     local[..., d:, 1] = pieces[..., d:]

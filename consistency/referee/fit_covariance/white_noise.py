@@ -12,7 +12,14 @@ import numpy as np
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.estimation import interval_of, maximise, nees_of, score_of
-from consistency.referee.fit_covariance.motion_windows import DriveWindows, angles, blocks_of, mean_square, norms, ways
+from consistency.referee.fit_covariance.motion_windows import (
+    DriveWindows,
+    angles,
+    jackknife_blocks,
+    mean_square,
+    norms,
+    ways,
+)
 from consistency.referee.fit_covariance.systematic_errors import (
     NEIGHBOURS,
     Mean,
@@ -206,7 +213,7 @@ def variance_intervals(noise: WhiteNoise, windows: DriveWindows) -> tuple[Interv
     error = corrected.errors
     F = fitted_terms(corrected, noise.mean_fit)
     whole: Indices = np.arange(len(error))
-    rests = [np.setdiff1d(whole, block) for block in blocks_of(windows.drive)]
+    rests = [np.setdiff1d(whole, block) for block in jackknife_blocks(windows.drive)]
     left = [fit_terms(error[rest], F[rest], noise.floor, noise.theta) for rest in rests]
     terms = zip(noise.theta.tolist(), np.transpose(left), strict=True)
     return tuple(interval_of(*term) for term in terms)

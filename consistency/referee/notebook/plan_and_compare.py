@@ -60,7 +60,7 @@ def plan(
     if like is not None:
         pilots, pilot_dof = judge_sources.pilots_of_records([like if isinstance(like, Record) else read(like)])
         dof = pilot_dof
-    return judge_sources.plan(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
+    return judge_sources.plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
 
 
 @naming_arguments

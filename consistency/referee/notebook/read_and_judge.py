@@ -16,7 +16,7 @@ from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.record import Record, numbered_axes
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
-from consistency.referee.document.tables import document, summary
+from consistency.referee.document.tables import document, summary_blocks
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.readers.formats.archives import UNWEIGHTED
 from consistency.referee.readers.options import (
@@ -38,7 +38,7 @@ from consistency.referee.readers.pipeline.read_files import checked_options, rea
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
 from consistency.referee.verdicts.inspect_sources import Inspection
-from consistency.referee.verdicts.inspect_sources import inspect as inspect_file
+from consistency.referee.verdicts.inspect_sources import inspect_files as inspect_file
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
 OF_PATHS = ("truth", "covariance", "by_file")  # options that are paths
@@ -324,14 +324,14 @@ def record_html(record: Record) -> str:
 
 
 def verdict_text(verdict: Verdict) -> str:
-    return fragment(*summary(verdict))
+    return fragment(*summary_blocks(verdict))
 
 
 def verdict_html(verdict: Verdict) -> str:
     """The sentence, the table, and below it the picture where the record is kept and one can be drawn."""
     from consistency.referee.pages.record_figures import overview
 
-    blocks = list(summary(verdict))
+    blocks = list(summary_blocks(verdict))
     if verdict.record is not None:
         with suppress(InputError):  # neither errors nor NEES
             blocks.append(Figure("Errors, NEES, coverage", "", (overview(verdict.record, verdict),)))

@@ -32,7 +32,7 @@ from consistency.referee.document.blocks import (
     style,
     table,
 )
-from consistency.referee.document.tables import FILTER, cells, columns, page, reason, with_values
+from consistency.referee.document.tables import FILTER, cells, columns, known_measures, page, reason
 from consistency.referee.types import Array, Failure, Indices
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ DECADE = 10.0  # values that span more are drawn on a log axis
 def judgement(study: Judged) -> list[Block]:
     """Table and sentences of one study, and its failed runs."""
     reasons = Reasons(tuple(reason(track.verdict, track.name, track.look, verbose=False) for track in study.tracks))
-    view = with_values(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
+    view = known_measures(page(equivalence_interval(study)), [track.verdict for track in study.tracks])
     cells_of = [(Name(track.name, track.look), *cells(view, track.verdict)) for track in study.tracks]
     label = f"Verdicts of {study.name}"
     shown = table((FILTER, *columns(view)), cells_of, label, caption=verdicts_caption(study), style="narrow")

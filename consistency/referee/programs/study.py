@@ -198,7 +198,7 @@ def _run(
         cwd = Path(cwd)
     program = program_of(argv, here, cwd)
     inputs = () if each is None else inputs_of(each, here)
-    plan = Plan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
+    plan = ProgramPlan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
     reading = make_reading(**options)
     if out is not None:
         return run_study(program, plan, Path(out), estimates, reading, resume, overwrite)
@@ -217,7 +217,7 @@ def _chosen(records: Sequence[Record], name: str | None) -> Record:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProgramPlan:
     """How many runs there are, and how each is done and judged."""
 
     runs: int | None = None  # None: as many as a verdict takes, planned from the first run
@@ -245,7 +245,7 @@ class Plan:
 
 def run_study(
     program: Program,
-    plan: Plan,
+    plan: ProgramPlan,
     out: Path,
     estimates: str = "estimates.csv",
     reading: Reading | None = None,
@@ -290,7 +290,7 @@ def run_study(
     return records, verdicts
 
 
-def _required(plan: Plan, r: Reading) -> Reading:
+def _required(plan: ProgramPlan, r: Reading) -> Reading:
     """The options, checked before any work."""
     if plan.runs is not None and plan.runs < 1:
         raise InputError(f"--runs must be at least 1, got {plan.runs}")
@@ -318,7 +318,7 @@ def _required(plan: Plan, r: Reading) -> Reading:
     return checked_options(r)
 
 
-def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> None:
+def _require_paths(program: Program, plan: ProgramPlan, estimates: str, r: Reading) -> None:
     """Refuse one file for all runs, a placeholder without its option, and a truth that is not where it should be."""
     for part in ("{input}", "{name}"):
         if not plan.inputs and any(part in word for word in program.words):
@@ -340,7 +340,7 @@ def _require_paths(program: Program, plan: Plan, estimates: str, r: Reading) -> 
             raise InputError(f"--{name}: {missing[0]} is not there{more}")
 
 
-def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[str, Any]:
+def _manifest(program: Program, plan: ProgramPlan, estimates: str, r: Reading) -> dict[str, Any]:
     reading = {name: str(value) if name in PATHS else value for name, value in r.as_options().items()}
     here = program.here
     return {
@@ -356,7 +356,9 @@ def _manifest(program: Program, plan: Plan, estimates: str, r: Reading) -> dict[
 class _Loop:
     """Runs in progress and done, and what is known of them so far."""
 
-    def __init__(self, program: Program, plan: Plan, study: ProgramStudy, r: Reading, fields: dict[str, Any]) -> None:
+    def __init__(
+        self, program: Program, plan: ProgramPlan, study: ProgramStudy, r: Reading, fields: dict[str, Any]
+    ) -> None:
         self.program, self.plan, self.study, self.options = program, plan, study, r
         self.fields = fields  # of the manifest
         self.runs = ProgramRuns(study, r, found_in)

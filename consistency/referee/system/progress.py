@@ -68,7 +68,7 @@ def each(items: Iterable[T], total: int, label: str, unit: str) -> Iterator[T]:
             advance(1)
 
 
-def counted(items: Sequence[T], label: str, unit: str) -> Iterator[T]:
+def with_progress(items: Sequence[T], label: str, unit: str) -> Iterator[T]:
     """The items, with progress over them if there are several and they take more than some seconds."""
     if len(items) < 2:
         yield from items

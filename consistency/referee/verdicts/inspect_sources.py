@@ -119,7 +119,7 @@ class Attempt:
         return list(chain.from_iterable(map(_facts, self.found)))
 
 
-def inspect(path: Path, r: Reading | None = None) -> Inspection:
+def inspect_files(path: Path, r: Reading | None = None) -> Inspection:
     """Inspect a file or folder; ``r`` has options that are known already.
 
     Raises

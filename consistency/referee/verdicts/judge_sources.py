@@ -145,7 +145,7 @@ def refused(error: ValueError) -> InputError:
     return InputError(f"--{OPTION.get(name, name)} {rest}")
 
 
-def plan(
+def plan_runs(
     dof: int,
     detect: float,
     false_alarm: float,

@@ -108,7 +108,7 @@ def read_innovations(
     return read_nis(path, filter_name, run, r)
 
 
-def without_first(log: NisLog, skip: Skip | None) -> NisLog:
+def skip_first(log: NisLog, skip: Skip | None) -> NisLog:
     """The innovations after the first steps or seconds, which keep their numbers.
 
     Raises

@@ -42,6 +42,7 @@ from consistency.referee.document.tables import (
     cells,
     comparison_table,
     document,
+    known_measures,
     map_cells,
     map_lines,
     map_text,
@@ -49,7 +50,6 @@ from consistency.referee.document.tables import (
     plan_lines,
     rejection_cells,
     rejection_text,
-    with_values,
 )
 from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
 
@@ -188,7 +188,7 @@ def test_every_view_takes_its_cells_from_the_verdict():
 
 
 def test_columns_without_any_value_are_left_out():
-    heads = [m.column.head for m in with_values(page(""), [verdict_of(1.0), verdict_of(2.0)])]
+    heads = [m.column.head for m in known_measures(page(""), [verdict_of(1.0), verdict_of(2.0)])]
     assert "NIS / dof" not in heads
     assert {"Verdict", "Mean ANEES", "Worst axis"} <= set(heads)
 

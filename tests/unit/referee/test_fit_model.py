@@ -18,8 +18,14 @@ from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
 from consistency.referee.fit_covariance.drives import Drive, drive_of
 from consistency.referee.fit_covariance.estimation import interval_of, nees_of
-from consistency.referee.fit_covariance.motion_windows import blocks_of, cut_windows, in_plane, span_of, vectors_of
-from consistency.referee.fit_covariance.motion_windows import matrices_of as pieces_of
+from consistency.referee.fit_covariance.motion_windows import (
+    cut_windows,
+    in_plane,
+    jackknife_blocks,
+    span_of,
+    vectors_of,
+)
+from consistency.referee.fit_covariance.motion_windows import motion_matrices as pieces_of
 from consistency.referee.fit_covariance.noise_model import caution, model_sentence, noise_lines
 from consistency.referee.fit_covariance.refusals import (
     TERMS,
@@ -259,8 +265,8 @@ def test_intervals_of_the_jackknife():
     assert np.isnan(interval_of(0.0, [0.0] * 5).high)
     some = interval_of(8.0, [7.0, 8.0, 9.0, 8.5, 7.5])
     assert 0 < some.low < 8.0 < some.high
-    assert [len(b) for b in blocks_of(np.repeat(np.arange(6), 4))] == [4] * 6
-    assert [len(b) for b in blocks_of(np.zeros(40, int))] == [2] * 20
+    assert [len(b) for b in jackknife_blocks(np.repeat(np.arange(6), 4))] == [4] * 6
+    assert [len(b) for b in jackknife_blocks(np.zeros(40, int))] == [2] * 20
 
 
 def test_jitter_of_both_ends_is_the_floor(rng):

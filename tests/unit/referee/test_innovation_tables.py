@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 import consistency as cs
 from consistency.referee.readers.formats.innovation_files import read_nis
-from consistency.referee.verdicts.monitor_sources import without_first
+from consistency.referee.verdicts.monitor_sources import skip_first
 
 OPTIMAL = ("--innovations", "optimal")
 V = np.array([[0.3, -0.2], [0.1, 0.4], [-0.6, 0.0]])
@@ -154,7 +154,7 @@ def test_the_first_steps_are_left_out_and_the_others_keep_their_numbers(capsys):
     whole = json.loads(consistency(capsys, "monitor", "a.csv", *OPTIMAL, "--json")[0])
     assert whole["alarm"]["since"] == 11
     log = read_nis(Path("a.csv"))
-    assert without_first(log, None) is log
+    assert skip_first(log, None) is log
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from consistency.referee.diagnostics.number_of_runs import share_limit
 from consistency.referee.diagnostics.tails import lost_evidence, lost_of
 from consistency.referee.gating.session import RunningTest, watching
 from consistency.referee.types import Failure
-from consistency.referee.verdicts.judge_sources import plan
+from consistency.referee.verdicts.judge_sources import plan_runs
 from consistency.testing import InsufficientTrials, assert_consistent
 
 SURE = 1e-5
@@ -79,8 +79,8 @@ def test_plans_have_at_least_these_runs():
 
 
 def test_a_plan_has_thirty_runs_and_a_gate_what_its_scale_takes():
-    assert plan(15, 1.5, 0.05, 0.95)["runs"] == 30 > gate_runs(15, 1.5) == 13
-    assert plan(3, 1.5, 0.05, 0.95)["runs"] == gate_runs(3, 1.5) == 61
+    assert plan_runs(15, 1.5, 0.05, 0.95)["runs"] == 30 > gate_runs(15, 1.5) == 13
+    assert plan_runs(3, 1.5, 0.05, 0.95)["runs"] == gate_runs(3, 1.5) == 61
     assert pilot_plan(np.linspace(0.99, 1.01, 40), 15, 100, 2.0).runs == 30
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from consistency.referee.system import progress as module
-from consistency.referee.system.progress import announce, counted, each, progress, quiet, say
+from consistency.referee.system.progress import announce, each, progress, quiet, say, with_progress
 
 
 def test_what_is_announced_is_said_where_all_else_is_quiet(capsys):
@@ -50,11 +50,11 @@ def test_an_item_that_breaks_leaves_nobody_quiet(capsys):
 def test_several_items_are_counted_and_one_is_not(capsys, monkeypatch):
     clock = iter([0.0, 4.0, 5.0])
     monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
-    assert list(counted("ab", "reading", "bags")) == ["a", "b"]
+    assert list(with_progress("ab", "reading", "bags")) == ["a", "b"]
     assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
         "reading: 1 of 2 bags", "reading: 2 of 2 bags",
     ]  # fmt: skip
-    assert list(counted("a", "reading", "bags")) == ["a"]  # no clock is read
+    assert list(with_progress("a", "reading", "bags")) == ["a"]  # no clock is read
 
 
 def test_brief_work_is_said_when_it_takes_long(capsys, monkeypatch):

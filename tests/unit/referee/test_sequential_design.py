@@ -24,7 +24,7 @@ from consistency.diagnostics import (
 )
 from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics import nees as betting
-from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.scale import equivalence, equivalence_by_betting
 from consistency.referee.types import Failure
 
@@ -149,7 +149,7 @@ def test_an_all_clear_at_a_look_takes_the_test_of_its_runs_too():
     assert equivalence_by_betting(means, 3, settings).shown
     of_runs = equivalence(means, 3, 20, settings, is_whole=True)
     assert not of_runs.shown
-    shown = findings_of(evidence, settings, Inspection(1 / 12, 1.0)).scale.equivalence
+    shown = findings_of(evidence, settings, InterimLook(1 / 12, 1.0)).scale.equivalence
     assert [shown.p_value, *shown.interval] == pytest.approx([of_runs.p_value, *of_runs.interval])
 
 
@@ -190,9 +190,9 @@ def test_a_look_inside_judge():
     """A scale just below and just above its half of the rate."""
     evidence = evidence_from(independent(np.random.default_rng(79), 24, 6, 3))(24)
     design = Design(3, false_alarm=0.01)
-    found = findings_of(evidence, design.settings, Inspection(None, 0.00499))
+    found = findings_of(evidence, design.settings, InterimLook(None, 0.00499))
     assert found.faults == ("scale",)
-    assert findings_of(evidence, design.settings, Inspection(None, 0.00501)).faults == ()
+    assert findings_of(evidence, design.settings, InterimLook(None, 0.00501)).faults == ()
 
 
 # --- until decided -------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 
-from consistency.referee.diagnostics.uncertain_truth import fit_shared
+from consistency.referee.diagnostics.uncertain_truth import fit_shared_error
 from consistency.referee.errors import InputError
 
 N, SIZE = 480, 3
@@ -24,7 +24,7 @@ def drawn(rng, count=N):
 
 def test_what_is_shared_is_found_and_predicted(rng):
     """6 standard deviations of theta (3 numbers: chance 1e-8); a floor of 480 errors to 6 x 3 %."""
-    fit = fit_shared(*drawn(rng), PRIOR)
+    fit = fit_shared_error(*drawn(rng), PRIOR)
     off = fit.mean - THETA
     assert off @ np.linalg.solve(fit.covariance, off) < 45.0
     assert_allclose(np.diag(P) + fit.floor**2, np.diag(P) + FLOOR**2, rtol=0.4)
@@ -37,7 +37,7 @@ def test_what_is_shared_is_found_and_predicted(rng):
 def test_the_fit_is_that_of_the_whole_gaussian(rng):
     """Theta given all errors by the joint covariance of everything, with the fitted floor."""
     errors, J, S = drawn(rng, 20)
-    fit = fit_shared(errors, J, S, PRIOR)
+    fit = fit_shared_error(errors, J, S, PRIOR)
     root = np.linalg.inv(np.linalg.cholesky(block_diag(*(S + np.diag(fit.floor**2)))))
     Q, R = np.linalg.qr(np.vstack([root @ J.reshape(-1, SIZE), np.diag(1.0 / PRIOR)]))
     mean = np.linalg.solve(R, Q[: errors.size].T @ root @ errors.ravel())
@@ -50,4 +50,4 @@ def test_the_fit_is_that_of_the_whole_gaussian(rng):
 def test_too_few_errors_and_wrong_shapes_are_refused(rng, count, size, said):
     errors, J, S = drawn(rng, count)
     with pytest.raises(InputError, match=said):
-        fit_shared(errors, J, S[:, :size, :size], PRIOR)
+        fit_shared_error(errors, J, S[:, :size, :size], PRIOR)

@@ -27,7 +27,7 @@ from consistency.referee.diagnostics.bias_and_shape import mean_shape, products_
 from consistency.referee.diagnostics.distributions import combined_p_value
 from consistency.referee.diagnostics.error_parts import run_tests
 from consistency.referee.diagnostics.nees import EarlyMeans, e_process, e_processes, ever
-from consistency.referee.diagnostics.record_findings import Inspection, findings_of
+from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.scale import RunMeans, equivalence_by_betting, ratio_interval, scale_test
 from consistency.referee.diagnostics.verdict_parts import MAIN, answers, named_p_values
@@ -259,9 +259,9 @@ def test_no_look_finds_a_scale_wrong_by_how_runs_end():
 
 def test_a_look_names_a_fault_that_the_e_process_of_equal_weights_has():
     record = diverging()
-    found = findings_of(record, Settings(), Inspection(1.0, 0.4, 1e-9))
+    found = findings_of(record, Settings(), InterimLook(1.0, 0.4, 1e-9))
     assert MAIN in found.faults
-    assert MAIN not in findings_of(record, Settings(), Inspection(1.0, 0.4)).faults
+    assert MAIN not in findings_of(record, Settings(), InterimLook(1.0, 0.4)).faults
 
 
 # --- weights that differ much ------------------------------------------------------------------------------------

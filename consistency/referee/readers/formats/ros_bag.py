@@ -24,7 +24,7 @@ from consistency.referee.readers.formats.tum import SpaceRun, poses_without_cova
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.runs_to_record import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
-from consistency.referee.system.progress import counted
+from consistency.referee.system.progress import with_progress
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance
@@ -63,14 +63,14 @@ def read_bags(path: Path, r: Reading, poses_alone: bool = False) -> list[Estimat
     if not is_one_bag(path):
         bags = sorted(filter(is_one_bag, path.iterdir()))
     if poses_alone:
-        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in counted(bags, *READING)], r)]
+        return [poses_without_covariances(path, [_bare_run(bag, r) for bag in with_progress(bags, *READING)], r)]
     if r.runs.relative is not None:
         raise InputError(f"{path}: --relative: {MARGINAL}")
     require_spatial(r.conventions.error, SPATIAL)
     _require_whole(path, bags)
     why = "; as the ROS messages define it; declare yours with --error"
     mixed = f"{path}: the covariances of some bags have cross terms, of others none; judge them apart"
-    found = space_estimator(path, (_run_of(bag, r) for bag in counted(bags, *READING)), r, why, mixed)
+    found = space_estimator(path, (_run_of(bag, r) for bag in with_progress(bags, *READING)), r, why, mixed)
     if r.statement.unstated and not any(one.own.covariance.any() for one in found.runs):
         return [found]
     judged, note = _stated(path, found.runs)

@@ -59,7 +59,7 @@ from consistency.referee.readers.truth_matching import (
     make_poses,
     unstated,
 )
-from consistency.referee.system.progress import counted
+from consistency.referee.system.progress import with_progress
 from consistency.referee.types import Array
 
 OPENVINS = "written by OpenVINS"
@@ -92,7 +92,7 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     stated_as.require_spatial(r.conventions.error, INERTIAL)
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.sources.covariance)
-    runs = (_run_of(own, true, P, truth_of, r) for own, true, P in counted(files, "reading", "files"))
+    runs = (_run_of(own, true, P, truth_of, r) for own, true, P in with_progress(files, "reading", "files"))
     return [poses_without_covariances(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
 
 

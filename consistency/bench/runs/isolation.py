@@ -25,8 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib.externals.loky.backend import get_context, resource_tracker
-from joblib.externals.loky.backend.reduction import dumps
 from threadpoolctl import threadpool_limits
 
 from consistency.bench.filters.compiled import Compiled
@@ -180,6 +178,7 @@ class _Worker:
                 "filters that are not compiled run in processes of their own, which a worker of multiprocessing.Pool "
                 "cannot start; use concurrent.futures or joblib"
             )
+        from joblib.externals.loky.backend import get_context  # slow to load
         from pebble import ProcessPool
 
         context = get_context("loky")
@@ -276,6 +275,8 @@ def _reason(code: int | None) -> str:
 
 
 def _isolated(filter_: Filter) -> Isolated:
+    from joblib.externals.loky.backend.reduction import dumps
+
     name = name_of(filter_)
     try:
         pickled = bytes(dumps(filter_))
@@ -311,6 +312,8 @@ def _show(printed: Connection) -> None:
 
 def _start_tracker() -> None:
     """Start loky's tracker of semaphores, which removes those of a process that is killed, without its warning."""
+    from joblib.externals.loky.backend import resource_tracker
+
     warnings_before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker"
     try:

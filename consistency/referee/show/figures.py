@@ -121,6 +121,8 @@ def with_small_ones(height: float, many: int) -> tuple[Figure, list[Axes]]:
 
     figure, columns = Figure(figsize=(WIDTH, height)), -(-many // 2)
     grid = figure.add_gridspec(2, 1 + columns, width_ratios=(2.0, *(1.0,) * columns))
+    engine: Any = figure.get_layout_engine()
+    engine.set(h_pad=0.14)  # of a panel beside two rows it leaves out the name of the axis
     places = [grid[:, 0], *(grid[k % 2, 1 + k // 2] for k in range(many))]
     return figure, [figure.add_subplot(place) for place in places]
 
@@ -391,8 +393,7 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
         figure.set_dpi(POINTS)
         FigureCanvasSVG(figure)
         engine: Any = figure.get_layout_engine()
-        for _ in range(2):  # a map is as wide as its height leaves room for
-            engine.execute(figure)
+        engine.execute(figure)
         figure.set_layout_engine("none")
     for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
         patch.set_visible(False)  # the ground is that of the page

@@ -117,9 +117,7 @@ def test_components_do_not_have_the_colour_of_the_estimate():
 def test_groups_come_first():
     rng = np.random.default_rng(3)
     errors = rng.standard_normal((40, 10, 2))
-    verdict = cs.judge(
-        errors, np.broadcast_to(np.eye(2), (40, 10, 2, 2)), by={"speed": rng.random((40, 10))}
-    )
+    verdict = cs.judge(errors, np.broadcast_to(np.eye(2), (40, 10, 2, 2)), by={"speed": rng.random((40, 10))})
     made = compose_files([verdict.record], {verdict.filter: verdict}, "T", {})
     assert made.chapters[0].blocks[0].title == "By speed"
 

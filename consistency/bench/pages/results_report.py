@@ -23,7 +23,7 @@ from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.number_words import names_in_a_row, plural
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Settings
-from consistency.referee.document.blocks import Chapter, Document
+from consistency.referee.document.blocks import Chapter, Document, Status, badges
 from consistency.referee.errors import InputError
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.system.folders import read_manifest
@@ -115,7 +115,15 @@ def compose(report: Report) -> Document:
         Chapter("provenance", "Provenance", "Provenance", provenance(report), on_paper=only_page),
     )  # fmt: skip
     shown = tuple(chapter for chapter in chapters if chapter.blocks)
-    return Document(report.title, answer(report.studies, report.findings), shown, several_studies.opening(report))
+    text, opening = answer(report.studies, report.findings), several_studies.opening(report)
+    return Document(report.title, text, shown, opening, badges=words_of(report))
+
+
+def words_of(report: Report) -> tuple[Status, ...]:
+    """The outcome of each finding, or of results without findings the verdict on each filter."""
+    named = [(str(f["id"]), outcome(str(f["source"] or ""), str(f["verdict"]))) for f in report.findings]
+    tracks = [(track.name, track.verdict.status) for study in report.studies for track in study.tracks]
+    return badges(named or tracks)
 
 
 def _of_experiments(report: Report, brief: bool) -> list[Chapter]:

@@ -20,8 +20,10 @@ from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import values_of
 from consistency.referee.diagnostics.number_words import names_in_a_row
 from consistency.referee.document.blocks import (
-    COLOURS,
     EXPECTED,
+    OVER,
+    RIGHT,
+    UNDER,
     Block,
     Cell,
     Chapter,
@@ -34,6 +36,7 @@ from consistency.referee.document.blocks import (
     Stack,
     Table,
     Text,
+    badges,
     brief,
     number,
     solid,
@@ -49,12 +52,12 @@ if TYPE_CHECKING:
 
 # colour and marker of a verdict: each has a shape of its own, so that a grey print still reads
 LOOKS = {
-    "consistent": Look(COLOURS[0], marker="o", size=8.0),
-    "overconfident": Look(COLOURS[1], marker="^", size=6.5),
-    "conservative": Look(COLOURS[5], marker="v", size=6.5),
-    "biased": Look(COLOURS[3], marker="D", size=5.5),
-    "heavy-tailed": Look(COLOURS[4], marker="s", size=6.0),
-    "inconsistent": Look(COLOURS[1], marker="P", size=6.0),
+    "consistent": Look(RIGHT, marker="o", size=8.0),
+    "overconfident": Look(OVER, marker="^", size=6.5),
+    "conservative": Look(UNDER, marker="v", size=6.5),
+    "biased": Look("#CC79A7", marker="D", size=5.5),
+    "heavy-tailed": Look("#8a2a63", marker="s", size=6.0),
+    "inconsistent": Look(OVER, marker="P", size=6.0),
     "undecided": Look("#ffffff", marker="o", size=6.5, edge="#6e6e6e"),
     "failed": Look("#111111", marker="X", size=6.0),
 }
@@ -63,7 +66,7 @@ HYPHENATED = {
     "consistent": "Con-\nsistent", "overconfident": "Over-\nconfident", "conservative": "Conser-\nvative",
     "heavy-tailed": "Heavy-\ntailed", "inconsistent": "Incon-\nsistent", "undecided": "Un-\ndecided",
 }  # fmt: skip
-SMALL, LARGE = COLOURS[0], COLOURS[1]  # of a ratio below and above 1: blue and vermilion, told apart by everybody
+SMALL, LARGE = UNDER, OVER  # of a ratio below and above 1: blue and vermilion, told apart by everybody
 NOTHING, PAPER = "#e3e3e3", "#ffffff"
 FULL = 4.0  # ratio from which on the colour is full, and 1 over it
 DARK = 0.45  # luminance below which text is white
@@ -91,7 +94,8 @@ def compose_regime(regime: Regime) -> Document:
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
         Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
     ]
-    return Document(f"Regime map: {sweep.name}", consistent_cells_sentence(regime), tuple(chapters))
+    words = badges([(name, result.status) for (_, name), result in regime.results.items()])
+    return Document(f"Regime map: {sweep.name}", consistent_cells_sentence(regime), tuple(chapters), badges=words)
 
 
 def _regions(regime: Regime) -> list[Chapter]:

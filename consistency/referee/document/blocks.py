@@ -1,12 +1,14 @@
 """What a document is made of: text, tables, lists of facts, figures.
 
-Numbers as words and colours are the same in every format. Colours are those of Okabe & Ito (2008). Each style has a
-dash pattern and a marker of its own as well, so that a grey print still reads.
+Numbers as words and colours are the same in every format, and a colour means one thing: vermilion, green and sky blue
+of Okabe & Ito (2008) are verdicts, black is the truth, and no filter has them. Each style has a dash pattern and a
+marker of its own as well, so that a grey print still reads.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -18,7 +20,8 @@ from consistency.referee.diagnostics.number_words import short, with_subject
 INTERVAL = re.compile(r"\[([^\s\[\]]+), ([^\s\[\]]+)\]")
 SMALLEST = 1e-6  # p value below which digits say nothing
 TRUTH, ODOMETRY, BAND = "#000000", "#7f7f7f", "#d9d9d9"
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+COLOURS = ("#0072B2", "#AA4499", "#8A8A1F", "#332288", "#DD77AA", "#6B4423")  # of filters
+OVER, RIGHT, UNDER = "#D55E00", "#009E73", "#56B4E9"  # of the verdicts overconfident, consistent and conservative
 # lengths in points, drawn and left out; 5 patterns and 6 colours repeat together only after 30
 DASHES: tuple[tuple[float, ...], ...] = (
     (),
@@ -28,6 +31,7 @@ DASHES: tuple[tuple[float, ...], ...] = (
     (3.0, 1.5, 1.0, 1.5, 1.0, 1.5),
 )
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # Matplotlib's names
+FEW = 6  # verdicts that have a badge each
 SIGMAS = 2.0  # stated standard deviations from 0 to the bounds of an error that are drawn
 
 
@@ -181,7 +185,7 @@ class Details:
     """Blocks that a reader of the page unfolds; on paper, blocks under a heading."""
 
     summary: str
-    blocks: tuple[Facts | Settings | Table, ...]
+    blocks: tuple[Facts | Settings | Table | Figure, ...]  # figures are on the page only
     whole: bool = False  # not broken between pages
 
 
@@ -242,6 +246,7 @@ class Document:
     opening: tuple[Block, ...] = ()  # below the answer, before the contents
     data: Any = None  # the same for programs: names, numbers, texts, arrays and verdicts
     command: str = ""  # by which it is written
+    badges: tuple[Status, ...] = ()  # above the answer: the word of each verdict, or how often it was given
 
     @property
     def parts(self) -> tuple[tuple[Block, ...], ...]:
@@ -257,7 +262,9 @@ class Document:
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        return tuple(block for part in self.parts for block in part if isinstance(block, Figure))
+        shown = [block for part in self.parts for block in part]
+        unfolded = [inner for block in shown if isinstance(block, Details) for inner in block.blocks]
+        return tuple(block for block in (*shown, *unfolded) if isinstance(block, Figure))
 
     @property
     def reasons(self) -> Iterator[Reason]:
@@ -272,6 +279,15 @@ class Document:
 def table(columns: tuple[Column, ...], rows: Sequence[tuple[Cell, ...]], label: str, **options: str | bool) -> Table:
     """Table of rows without groups."""
     return Table(columns, (("", tuple(rows)),), label, **options)  # type: ignore[arg-type]
+
+
+def badges(named: Sequence[tuple[str, str]]) -> tuple[Status, ...]:
+    """A badge for each of a few names and words of verdicts; of many, one for each word with how often it was given."""
+    if len(named) == 1:
+        return (Status(named[0][1]),)
+    if len(named) <= FEW:
+        return tuple(Status(word, f" {name}") for name, word in named)
+    return tuple(Status(word, f" {count}") for word, count in Counter(word for _, word in named).items())
 
 
 NONE = Quantity(None)
@@ -405,7 +421,7 @@ class Look:
 EXPECTED = Look("#555555", width=0.8)
 LIMIT = Look("#333333", (4.0, 3.0), width=0.9)
 ZERO = Look("#555555", width=0.5)
-ACCEPTED, REJECTED = Look(COLOURS[0], (), "o"), Look(COLOURS[1], (), "X")
+ACCEPTED, REJECTED, LOW = Look(RIGHT), Look(OVER, marker="X"), Look(UNDER, marker="v")
 
 
 def style(index: int) -> Look:

@@ -16,7 +16,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.document.blocks import Chapter, Document, Figure, Text
+from consistency.referee.document.blocks import Chapter, Document, Figure, Status, Text
 from consistency.referee.fit_covariance.correct import (
     ByGroup,
     Correction,
@@ -438,4 +438,6 @@ def correction_page(found: Correction) -> Document:
         "with its interval; and the share of held-out errors inside the ellipsoid of each probability."
     )
     title = "Held-out runs, factors and coverage"
-    return page_of(correction_document(found), title, caption, partial(draw_correction, found))
+    page = page_of(correction_document(found), title, caption, partial(draw_correction, found))
+    after = Status(found.status, " after")
+    return replace(page, badges=(after,) if found.assumed else (Status(found.before.verdict.status, " before"), after))

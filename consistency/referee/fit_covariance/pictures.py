@@ -16,13 +16,13 @@ from consistency.referee.fit_covariance.estimation import nees_of
 from consistency.referee.fit_covariance.motion_windows import mean_square, span_of
 from consistency.referee.pages.record_figures import ellipse
 from consistency.referee.show.figures import (
+    add_legend,
     canvas,
     curve,
     dots,
     intervals,
     log_axis,
     name_rows,
-    panel_legend,
     path,
     points,
     stroke,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 SHOWN = 3  # spans with a panel of errors
-MOST_ROWS = 30  # runs that have a row
+MOST_ROWS = 16  # runs that have a row
 ROW = 0.14  # in, height of one
 MANY = 2000  # errors of motions that are drawn
 EACH = replace(style(0), size=2.0, alpha=0.7)
@@ -52,7 +52,7 @@ def draw_noise(model: Any) -> Drawing:
     _draw_growth(growth, model, axes[:d], "m²")
     _draw_growth(turns, model, axes[d:], "rad²")
     _draw_drives(drives, model)
-    return figure
+    return add_legend(figure)
 
 
 def _draw_errors(axes: Axes, model: Any, judged: JudgedSpan) -> None:
@@ -63,7 +63,7 @@ def _draw_errors(axes: Axes, model: Any, judged: JudgedSpan) -> None:
     axes.axvline(0.0, **stroke(ZERO))
     axes.axhline(0.0, **stroke(ZERO))
     points(axes, error[:, 0], error[:, 1], EACH, limit=MANY)
-    path(axes, ellipse(np.zeros(2), C.mean(axis=0)), solid(style(1)))
+    path(axes, ellipse(np.zeros(2), C.mean(axis=0)), solid(style(1)), "95 % ellipse")
     title = f"{span_of(judged.span).text}: {100 * inside:.0f} % of {len(error)} inside"
     axes.set(xlabel="error in x (m)", ylabel="error in y (m)", title=title)
 
@@ -85,7 +85,6 @@ def _draw_growth(
     panel.set(xlabel=f"span ({unit_of_span})", ylabel=f"mean squared error ({unit})")
     log_axis(panel, "x")
     log_axis(panel, "y")
-    panel_legend(panel)
 
 
 def _draw_drives(axes: Axes, model: Any) -> None:
@@ -101,7 +100,7 @@ def _draw_drives(axes: Axes, model: Any) -> None:
 def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
     """Ratios of true to stated covariance, a row for each name, beside those that count as consistent."""
     name_rows(axes, names)
-    axes.axvspan(1.0 / DETECT, DETECT, color=BAND, linewidth=0, zorder=0.4)
+    axes.axvspan(1.0 / DETECT, DETECT, color=BAND, linewidth=0, zorder=0.4, label="consistent if shown inside")
     axes.axvline(1.0, **stroke(EXPECTED))
     for number, values in enumerate(ratios):
         axes.plot(values, np.arange(len(values)), **dots(style(number)))
@@ -118,7 +117,7 @@ def draw_correction(found: Any) -> Drawing:
     log_axis(runs, "x")
     _draw_factors(factors, found)
     _draw_coverage(coverage, found)
-    return figure
+    return add_legend(figure)
 
 
 def _draw_factors(axes: Axes, found: Any) -> None:
@@ -142,4 +141,3 @@ def _draw_coverage(axes: Axes, found: Any) -> None:
     curve(axes, levels, found.before.covered(levels), solid(style(0)), "stated")
     curve(axes, levels, found.after.covered(levels), solid(style(1)), "corrected")
     axes.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
-    panel_legend(axes)

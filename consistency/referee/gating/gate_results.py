@@ -12,7 +12,18 @@ import numpy as np
 from consistency.referee.diagnostics.comparison import Comparison
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
-from consistency.referee.document.blocks import Cell, Column, Document, Quantity, Reason, Status, Table, fragment, table
+from consistency.referee.document.blocks import (
+    Cell,
+    Column,
+    Document,
+    Quantity,
+    Reason,
+    Status,
+    Table,
+    badges,
+    fragment,
+    table,
+)
 from consistency.referee.gating.checked_input import planned_detect, planned_dof, rate_shares
 from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
 from consistency.referee.show import rendered
@@ -161,7 +172,9 @@ def gate_document(ledger: Ledger) -> Document:
         "false_alarm_bound": ledger.bound(),
         "gates": [vars(entry) for entry in ledger.entries()],
     }
-    return Document("Consistency gates", f"{ending(ledger)}.", (), (_table(ledger.entries(), HEADS),), data)
+    words = badges([(entry.test or entry.name, entry.status) for entry in ledger.entries()])
+    shown = _table(ledger.entries(), HEADS)
+    return Document("Consistency gates", f"{ending(ledger)}.", (), (shown,), data, badges=words)
 
 
 def write_gates(ledger: Ledger, path: Path) -> None:

@@ -13,7 +13,7 @@ from consistency.referee.diagnostics.number_words import UNCERTAIN
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
 from consistency.referee.pages.verdicts import Judged
-from consistency.referee.show.figures import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+from consistency.referee.show.figures import add_legend, canvas, dodge, dots, intervals, log_axis, name_rows, stroke
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics.verdict_parts import SIDES, ByGroup, Group
-from consistency.referee.document.blocks import ACCEPTED, BAND, REJECTED, Look
+from consistency.referee.document.blocks import ACCEPTED, BAND, LOW, REJECTED, Look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,7 +189,7 @@ def axis_caption(study: Judged, found: tuple[Forest, ...]) -> str:
     )
 
 
-OPEN = Look("#7f7f7f")
+OPEN, STATED = Look("#7f7f7f"), Look("#333333", marker="D", size=4.0)
 
 
 def ratio_by_group_figure(verdict: Verdict) -> tuple[Figure, ...]:
@@ -232,12 +232,8 @@ def _draw_groups(axes: Axes, by: ByGroup, labels: tuple[str, ...], factor: float
 
 def _look(status: str) -> Look:
     """At fault, shown to be right, or neither."""
-    look = OPEN
-    if status in SIDES:
-        look = REJECTED
-    elif status == "consistent":
-        look = ACCEPTED
-    return replace(look, size=3.2, width=1.1)
+    looks = {"consistent": ACCEPTED, "conservative": LOW} | {side: REJECTED for side in SIDES if side != "conservative"}
+    return replace(looks.get(status, OPEN), size=3.2, width=1.1)
 
 
 def _caption(of_parts: Mapping[str, ByGroup]) -> str:
@@ -250,3 +246,43 @@ def _caption(of_parts: Mapping[str, ByGroup]) -> str:
     if first.outcome:
         return f"{text}{first.column} {first.outcome}, which selects on the outcome: groups show, they do not convict."
     return f"{text}The questions decide, not the bars."
+
+
+def bound_figures(verdict: Verdict) -> tuple[Figure, ...]:
+    """A row for each bound and group: how often the error is outside, and the factor; nothing without bounds."""
+    scores = verdict.bounds
+    if not scores:
+        return ()
+    labels = tuple(score.name for score in scores)
+    factor = next((score.equivalence.factor for score in scores), 1.0)
+
+    def draw() -> Drawing:
+        figure, (shares, factors) = canvas(0.5 + 0.2 * len(labels), 2, 2)
+        most = 100.0 * max(
+            max(s.rate, 1.0 - s.level, s.rate_limit if np.isfinite(s.rate_limit) else 0.0) for s in scores
+        )
+        shares.set(xlabel="steps outside the bound (%)", xlim=(0.0, 1.1 * most))
+        factors.set(xlabel="factor by which the bound must grow", xlim=ratio_window([(*s.factor,) for s in scores]))
+        factors.axvspan(1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.5, label="consistent if shown inside")
+        factors.axvline(1.0, **stroke(EXPECTED))
+        for axes in (shares, factors):
+            name_rows(axes, labels)
+        expected = [100.0 * (1.0 - score.level) for score in scores]
+        shares.plot(expected, range(len(scores)), label="stated by the level", **dots(STATED))
+        for kind in dict.fromkeys(score.status or "not judged" for score in scores):
+            rows = [row for row, score in enumerate(scores) if (score.status or "not judged") == kind]
+            rates = [(100.0 * scores[row].rate,) * 2 + (100.0 * scores[row].rate_limit,) for row in rows]
+            intervals(shares, np.array(rows, float), np.array(rates), _look(kind))
+            intervals(
+                factors, np.array(rows, float), np.array([(*scores[row].factor,) for row in rows]), _look(kind), kind
+            )
+        log_axis(factors, "x")
+        factors.set_yticklabels([])
+        return add_legend(figure)
+
+    caption = (
+        "Left: share of the steps in which the error is outside, up to which larger shares are not excluded at 95 %, "
+        "beside the share that the level states. Right: factor by which the bound must grow for its level to hold, "
+        "with its 95 % interval; 1 is right (line), above is overconfident; log axis."
+    )
+    return (Figure("Coverage of the bounds", caption, (draw,)),)

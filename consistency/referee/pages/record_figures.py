@@ -20,7 +20,18 @@ from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.uncertain_truth import of_both
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import BAND, EXPECTED, LIMIT, SIGMAS, TRUTH, ZERO, Figure, Look, solid, style
+from consistency.referee.document.blocks import (
+    BAND,
+    EXPECTED,
+    LIMIT,
+    OVER,
+    SIGMAS,
+    TRUTH,
+    ZERO,
+    Figure,
+    Look,
+    style,
+)
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import CHARTS
 from consistency.referee.pages.verdicts import Clock, time_axis_of, wide
@@ -34,11 +45,11 @@ from consistency.referee.show.figures import (
     edges,
     log_axis,
     make_map,
-    panel_legend,
     path,
     points,
     rows_of,
     stroke,
+    with_small_ones,
 )
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.monitor_sources import Watched
@@ -47,6 +58,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
+STACK = 3  # panels one below the other
 MOST_PANELS = 12  # components of an error that are drawn
 MOST_RANKS = 21  # that are drawn
 SPREADS = 10  # groups of steps by the spread of the members
@@ -61,20 +73,22 @@ INSIDE = "#e3eef6"  # ground within 2 sigma
 LEAST_REACH = 3.0  # sigma, from 0 to the ends of an axis
 JOINT = Look("#333333", width=1.4)
 EACH_RUN = replace(style(0), size=2.0, alpha=0.7)
-WORST = replace(solid(style(1)), size=3.5)
+WORST = Look("#333333", size=3.5, width=1.0)
+OVER_SIGMA = "Errors over their stated sigma"  # the title of what is drawn on demand
 Paint = Callable[["Axes"], None]
 IN_WORLD = ("so2", "so3", "so3-body", "vector", *CHARTS)  # errors whose position is about the axes of the world
 NAMES = "xyz"
-MOST = 5  # ellipses
+MOST = 4  # ellipses
 SHARE = 0.95  # of a right estimator's errors in a step that lie inside its ellipse
 CORNERS = 73
 TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
-ELLIPSE, AT = replace(style(1), dash=(), width=0.9), Look(TRUTH, marker="X", size=5.0)
+ELLIPSE, AT = replace(style(0), width=1.2), Look(TRUTH, marker="X", size=4.0)
 HEIGHT = 3.6  # inches
+FROM_START = "time from the start (s)"
 LONG = 2000  # test ratios drawn of a sensor
 POINTS = 600  # at most, of the NIS: few enough to see a change among them
 EACH_STEP = replace(style(0), size=1.8, alpha=0.7)
-FAULT = replace(style(1), dash=(), width=1.1)
+FAULT = Look(OVER, width=1.1)
 
 
 @dataclass(frozen=True)
@@ -86,27 +100,37 @@ class Picture:
     panels: tuple[Paint, ...]
     height: float = 1.3  # inches, of a row of panels
     is_shared: bool = True  # panels have one axis of time or runs
+    stacked: bool = False  # panels stand one below the other, so that a moment is found in all of them
+    beside: tuple[Paint, ...] = ()  # small panels at the right of the only one
 
     def figure(self) -> Figure:
         return Figure(self.title, self.caption, (self.draw,))
 
     def draw(self) -> Drawing:
-        many = len(self.panels)
-        columns = rows_of(many)
-        figure, panels = canvas(self.height * -(-many // columns), columns, many, sharex=self.is_shared and many > 1)
+        if self.beside:
+            figure, panels = with_small_ones(self.height, len(self.beside))
+            for axes, paint in zip(panels, (*self.panels, *self.beside), strict=True):
+                paint(axes)
+            return add_legend(figure)
+        many, columns = len(self.panels), rows_of(len(self.panels))
+        if self.stacked:
+            columns = -(-many // STACK)
+        rows = -(-many // columns)
+        shared = self.is_shared and many > 1
+        figure, panels = canvas(self.height * rows + 0.2 * self.stacked, columns, many, self.stacked, sharex=shared)
         for number, (axes, paint) in enumerate(zip(panels, self.panels, strict=True)):
             paint(axes)
-            if self.is_shared and number + columns < many:
+            if shared and (number + 1 < many and (number + 1) % rows if self.stacked else number + columns < many):
                 axes.set_xlabel("")
         return add_legend(figure)
 
 
 def record_figures(record: Record, verdict: Verdict) -> tuple[Figure, ...]:
-    """NEES, errors over sigma, the worst run, errors, trajectory, coverage, innovations; those that the record has."""
+    """NEES, errors, the worst run, trajectory, coverage, innovations, errors over sigma; those that the record has."""
     both = of_both(record)
     pictures = (
-        _nees(both, verdict), _errors_over_sigma(both), _worst_run(both), _errors(both), _trajectory(both),
-        _coverage(both), _ranks(record), _spread_and_skill(record), _innovations(both, verdict),
+        _bounded(record), _nees(both, verdict), _errors(both), _worst_run(both), _trajectory(both), _coverage(both),
+        _ranks(record), _spread_and_skill(record), _innovations(both, verdict), _errors_over_sigma(both),
     )  # fmt: skip
     note = f" {OF_BOTH}" if record.truth.covariance is not None else ""
     return tuple(
@@ -124,7 +148,7 @@ def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Dra
     """
     both = of_both(record)
     nees = None if verdict is None else _nees(both, verdict)
-    shown = (_errors(both), nees, _trajectory(both), _coverage(both))
+    shown = (_bounded(record), _errors(both), nees, _trajectory(both), _coverage(both))
     pictures = [picture for picture in shown if picture is not None]
     if not pictures:
         raise InputError(f"{record.name}: has neither errors nor NEES to draw; give --truth, or truth= in Python")
@@ -135,9 +159,8 @@ def overview(record: Record, verdict: Verdict | None = None) -> Callable[[], Dra
         figure, panels = canvas(0.3 + 1.5 * -(-len(paints) // columns), columns, len(paints), width=1.3 * WIDTH)
         for axes, paint in zip(panels, paints, strict=True):
             paint(axes)
-            panel_legend(axes)
-        figure.suptitle(record.name, x=0.0, ha="left")
-        return figure
+        panels[0].set_title(record.name)
+        return add_legend(figure)
 
     return draw
 
@@ -210,7 +233,8 @@ def _errors(record: Record) -> Picture | None:
         f"Error ({meaning}) of run {record.run_numbers[row]} with the 2-sigma bounds that the estimator "
         f"states (dashed). Honest errors stay inside about 95 % of the time.{more}{clock.note}"
     )
-    return Picture("Errors and stated bounds", caption, tuple(_error_curves(record, clock, row, c) for c in components))
+    curves = tuple(_error_curves(record, clock, row, c) for c in components)
+    return Picture("Errors and stated bounds", caption, curves, height=0.85, stacked=True)
 
 
 def _errors_of_runs(record: Record, of: Errors) -> Paint:
@@ -253,7 +277,7 @@ def _errors_over_sigma(record: Record) -> Picture | None:
         f"inside which honest errors stay about 95 % of the time.{clock.note}"
     )
     paints = tuple(_scaled_curves(record, clock, row, i) for i in range(min(len(record.errors.axes), MOST_PANELS)))
-    return Picture("Errors over their stated sigma", caption, paints)
+    return Picture(OVER_SIGMA, caption, paints, height=0.85, stacked=True)
 
 
 def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
@@ -293,6 +317,38 @@ def draw_bounded(axes: Axes, x: Array, error: Array, bound: Array, label: str) -
     curve(axes, x, error, SHOWN, label)
 
 
+def _bounded(record: Record) -> Picture | None:
+    """Errors over the bounds that are stated for them."""
+    ratios = record.errors.bound_ratios
+    if ratios is None:
+        return None
+    clock, row = time_axis_of(record.runs.t), shown_run(record)
+    others = np.linspace(0, len(ratios) - 1, MOST_RUNS + 1).astype(int)
+
+    def panel(number: int) -> Paint:
+        def paint(axes: Axes) -> None:
+            of = ratios[..., number]
+            reach = max(1.5, 1.1 * _most(of))
+            axes.set(ylabel=record.errors.bounds[number].name, ylim=(-reach if (of < 0.0).any() else 0.0, reach))
+            axes.axhspan(-1.0, 1.0, color=INSIDE, linewidth=0, zorder=0.4, label="inside the bound")
+            if has_one_step(record):
+                points(axes, record.run_numbers.astype(float), of[:, 0], EACH_RUN, f"error of a {record.runs.unit}")
+                _span_runs(axes, record)
+                return
+            label = "other runs"
+            for other in dict.fromkeys(others[others != row]):
+                curve(axes, clock.values, of[other], OTHERS, label)
+                label = ""
+            curve(axes, clock.values, of[row], SHOWN, f"run {record.run_numbers[row]}")
+            clock.name(axes)
+
+        return paint
+
+    caption = f"Error over its stated bound: outside the shade the bound does not hold.{clock.note}"
+    panels = tuple(map(panel, range(min(ratios.shape[-1], MOST_PANELS))))
+    return Picture("Errors over their bounds", caption, panels, height=0.95, stacked=True)
+
+
 # --- trajectory -------------------------------------------------------------------------------------
 
 
@@ -300,8 +356,8 @@ def _trajectory(record: Record) -> Picture | None:
     found = None if has_one_step(record) else trajectory_panel(record)
     if found is None:
         return None
-    caption, paint = found
-    return Picture("Trajectory", caption, (paint,), height=2.6)
+    caption, paint, close_ups = found
+    return Picture("Trajectory", caption, (paint,), height=2.6, beside=close_ups)
 
 
 # --- NEES -------------------------------------------------------------------------------------------
@@ -477,7 +533,7 @@ def _ranks(record: Record) -> Picture | None:
         axes.axhspan(1.0 / ranks - width, 1.0 / ranks + width, color=BAND, linewidth=0, zorder=0.5)
         axes.axhline(1.0 / ranks, **stroke(EXPECTED), label="expected")
         for number, (name, share) in enumerate(shares.items()):
-            axes.stairs(share, np.arange(ranks + 1) / ranks, **stroke(replace(style(number), width=1.1)), label=name)
+            axes.stairs(share, np.arange(ranks + 1) / ranks, **stroke(of_component(number)), label=name)
         axes.set(
             xlabel="rank of the truth among the members", ylabel="share of steps", xlim=(0.0, 1.0), ylim=(0.0, None)
         )
@@ -508,7 +564,7 @@ def _spread_and_skill(record: Record) -> Picture | None:
             groups = [group for group in np.array_split(rows, SPREADS) if len(group)]
             x, y = (np.sqrt([values[group, number].mean() for group in groups]) for values in (expected, square))
             unit = float(np.sqrt(np.mean(np.square(x)))) or 1.0
-            curve(axes, x / unit, y / unit, replace(style(number), marker="o", width=1.1), name)
+            curve(axes, x / unit, y / unit, replace(of_component(number), marker="o"), name)
             most = max(most, *(1.05 * np.concatenate([x, y]) / unit))
         axes.set(xlabel="spread that is stated", ylabel="error of the mean", xlim=(0.0, most), ylim=(0.0, most))
 
@@ -530,7 +586,7 @@ def _coverage(record: Record) -> Picture | None:
     def paint(axes: Axes) -> None:
         axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
         for number, (name, shares) in enumerate(found.items()):
-            look = JOINT if name == "all together" else replace(style(number), width=1.1)
+            look = JOINT if name == "all together" else of_component(number)
             curve(axes, p, shares, look, name)
         axes.set(xlabel="stated probability", ylabel="share of errors inside", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
 
@@ -572,14 +628,20 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
     return Picture("Innovations", caption, (paint,), height=1.6)
 
 
+def of_component(number: int) -> Look:
+    """How the component of this number looks; the first colour is that of the estimate."""
+    return replace(style(number + 1), width=1.1)
+
+
 def shown_run(record: Record) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
-    assert record.errors.error is not None
-    return int(np.argmax(np.isfinite(record.errors.error).all(axis=-1).sum(axis=1)))
+    values = record.errors.bound_ratios if record.errors.error is None else record.errors.error
+    assert values is not None
+    return int(np.argmax(np.isfinite(values).all(axis=-1).sum(axis=1)))
 
 
-def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | None:
-    """Caption, and what draws the shown run on axes; None where positions are not known.
+def trajectory_panel(record: Record) -> tuple[str, Paint, tuple[Paint, ...]] | None:
+    """Caption, what draws the shown run on axes, and each ellipse from near; None where positions are not known.
 
     It shows the two axes over which the path reaches furthest.
     """
@@ -592,30 +654,49 @@ def trajectory_panel(record: Record) -> tuple[str, Callable[[Axes], None]] | Non
         return None
     pair = furthest(record, np.ptp(true[known], axis=0))
     steps = _worst(record, row) if record.errors.convention in IN_WORLD else np.empty(0, np.int64)
+    outlines = ellipses_at(record, row, steps, pair)
 
     def paint(axes: Axes) -> None:
         path(axes, true[:, pair], TRUE, "truth")
         path(axes, estimated[:, pair], ESTIMATED, "estimate")
         label = "95 % ellipse"
-        for outline in ellipses_at(record, row, steps, pair):
+        for outline in outlines:
             path(axes, outline, ELLIPSE, label)
             label = ""
         if len(steps):
             axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
+        for number, step in enumerate(steps, 1):
+            axes.annotate(str(number), true[step, pair], xytext=(4.0, 4.0), textcoords="offset points", weight="bold")
         x, y = (record.errors.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
         axes.set(xlabel=f"{x} (m)", ylabel=f"{y} (m)")
         make_map(axes)
+
+    def close_up(number: int) -> Paint:
+        def paint(axes: Axes) -> None:
+            step, outline = steps[number], outlines[number]
+            axes.fill(*outline.T, color=INSIDE, linewidth=0, label="_nolegend_")
+            path(axes, true[:, pair], TRUE)
+            path(axes, estimated[:, pair], ESTIMATED)
+            path(axes, outline, ELLIPSE)
+            axes.plot(*true[step, pair], **dots(AT))
+            near = np.vstack([outline, true[step, pair]])
+            middle, reach = (near.min(axis=0) + near.max(axis=0)) / 2.0, 0.6 * float(np.ptp(near, axis=0).max())
+            axes.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
+            axes.set(title=f"{number + 1}: step {step + 1}", xlabel=f"{2.0 * reach:.2g} m wide")
+            axes.set(aspect="equal", xticks=[], yticks=[])
+
+        return paint
 
     caption = f"Trajectory of {record.runs.unit} {record.run_numbers[row]}, true and estimated."
     if len(steps):
         where = ", ".join(str(step + 1) for step in sorted(steps))
         caption += (
             " Ellipses: where the truth lies with 95 % by the stated covariance, in the steps whose errors are "
-            f"largest against it ({where}); crosses are the truth there."
+            f"largest against it ({where}); crosses are the truth there. Right: each of them from near."
         )
     elif record.errors.convention not in IN_WORLD:
         caption += " No ellipses: the stated covariance is not about the axes of the world."
-    return caption, paint
+    return caption, paint, tuple(map(close_up, range(len(steps))))
 
 
 def furthest(record: Record, reach: Array) -> list[int]:
@@ -663,28 +744,29 @@ def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
         figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
         _draw_sizes(above, shown)
         _draw_evidence(below, shown)
-        return figure
+        return add_legend(figure)
     figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
+    start = min((float(each.t[0]) for each in shown if len(each.t)), default=0.0)
     for axes, each in zip(panels, shown, strict=True):
-        _draw_ratios(axes, each)
-    panels[-1].set_xlabel("t / s")
-    return figure
+        _draw_ratios(axes, each, start)
+    panels[-1].set_xlabel(FROM_START)
+    return add_legend(figure)
 
 
-def _draw_ratios(axes: Axes, each: GateRatios) -> None:
+def _draw_ratios(axes: Axes, each: GateRatios, start: float) -> None:
     """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
-    points(axes, each.t, each.ratio, EACH_STEP, limit=LONG)
-    for at, look in ((1.0, LIMIT), (each.unusual, EXPECTED)):
+    points(axes, each.t - start, each.ratio, EACH_STEP, "test ratio", limit=LONG)
+    for at, look, label in ((1.0, LIMIT, "gate"), (each.unusual, EXPECTED, "rarely exceeded by a right filter")):
         if np.isfinite(at):
-            axes.axhline(at, **stroke(look))
+            axes.axhline(at, **stroke(look), label=label)
     axes.set(ylabel="test ratio", title=each.sensor)
 
 
 def _draw_sizes(axes: Axes, watched: Watched) -> None:
     """NIS over its degrees of freedom."""
     step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
-    points(axes, step, ratio, EACH_STEP, limit=POINTS)
-    axes.axhline(1.0, **stroke(EXPECTED))
+    points(axes, step, ratio, EACH_STEP, "NIS / dof", limit=POINTS)
+    axes.axhline(1.0, **stroke(EXPECTED), label="expected")
     axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
     if (ratio > 0).any():
         log_axis(axes, "y")
@@ -700,20 +782,22 @@ def _draw_evidence(axes: Axes, watched: Watched) -> None:
     if alarm is not None:
         since, raised = float(alarm.since), float(alarm.step)
         if label != "step":
-            since, raised = watched.since_t, watched.alarm_t
-        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0)
-        axes.axvline(raised, **stroke(FAULT))
-    axes.axhline(threshold, **stroke(LIMIT))
-    curve(axes, clock, watched.evidence, style(0))
+            since, raised = watched.since_t - watched.t[0], watched.alarm_t - watched.t[0]
+        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0, label="since the fault")
+        axes.axvline(raised, **stroke(FAULT), label="alarm")
+    axes.axhline(threshold, **stroke(LIMIT), label="e-value of an alarm")
+    evidence = np.minimum(watched.evidence, threshold**3)  # it may be near the largest number that there is
+    curve(axes, clock, evidence, style(0), "e-value")
     axes.set(xlabel=label, ylabel="e-value")
     log_axis(axes, "y")
-    axes.set_ylim(top=min(axes.get_ylim()[1], threshold**2))
+    low, high = evidence[evidence > 0.0].min(initial=1.0), evidence.max(initial=threshold)
+    axes.set_ylim(low / 2.0, min(2.0 * high, threshold**2))
 
 
 def _clock(watched: Watched) -> tuple[Array, str]:
-    """Times of the steps, s, or their numbers where some have none; and what they are."""
+    """Times of the steps from the first on, s, or their numbers where some have none; and what they are."""
     if len(watched.t) and np.isfinite(watched.t).all():
-        return watched.t, "t / s"
+        return watched.t - watched.t[0], FROM_START
     return watched.step, "step"
 
 

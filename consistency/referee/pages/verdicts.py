@@ -49,7 +49,7 @@ FOUND, TOLERATED, NOT_FOUND, NOT_ASKED = "✗", "≈", "○", "–"
 MARKS = {FOUND: "found", TOLERATED: "found, within the tolerance", NOT_FOUND: "not found", NOT_ASKED: "not asked"}
 OUTSIDE = "share of the steps of a run in which the error is outside, against 1 - level"
 NARROW = 4  # filters beside which the questions have less room
-EPOCH = 1e6  # s; times beyond are shown from the first on
+LATE = 0.05  # of its span by which a clock may begin after zero, and be shown as it is
 DECADE = 10.0  # values that span more are drawn on a log axis
 
 
@@ -307,7 +307,7 @@ def time_axis_of(t: Array) -> Clock:
     """
     if not len(t) or not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
         return Clock(np.arange(1.0, len(t) + 1), "step", "step")
-    if abs(t[0]) < EPOCH:
+    if 0.0 <= t[0] <= LATE * np.ptp(t):
         return Clock(t, "time (s)", "s")
     return Clock(t - t[0], "time (s)", "s", f" Time 0 is {t[0]:.2f} s.")
 

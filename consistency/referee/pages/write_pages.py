@@ -16,13 +16,13 @@ import numpy as np
 from consistency.referee.diagnostics.number_words import plural, with_subject
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Chapter, Document, Facts, Text, number
+from consistency.referee.document.blocks import Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
 from consistency.referee.pages import verdicts as questions_table
-from consistency.referee.pages.ratio_figures import by_axis, ratio_by_group_figure
-from consistency.referee.pages.record_figures import record_figures
+from consistency.referee.pages.ratio_figures import bound_figures, by_axis, ratio_by_group_figure
+from consistency.referee.pages.record_figures import OVER_SIGMA, record_figures
 from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
 from consistency.referee.show import FORMATS, rendered
 from consistency.referee.system.stopping import write_whole
@@ -237,20 +237,14 @@ def compose_files(
     named = {record.name: record for record in records}
     study = _study(tuple(judged.values()), title)
     several = len(judged) > 1
-    chapters = [
-        Chapter(
-            f"estimator-{i}",
-            name,
-            name,
-            (
-                *[Text(with_subject(name, _ended(verdict.reasons[0])))] * several,
-                *record_figures(named[name], verdict),
-                *ratio_by_group_figure(verdict),
-            ),
-            _counts(named[name], verdict),
-        )
-        for i, (name, verdict) in enumerate(judged.items())
-    ]
+    chapters = []
+    for i, (name, verdict) in enumerate(judged.items()):
+        sentence = [Text(with_subject(name, _ended(verdict.reasons[0])))] * several
+        pictures = *bound_figures(verdict), *ratio_by_group_figure(verdict), *record_figures(named[name], verdict)
+        at_once = [figure for figure in pictures if figure.title != OVER_SIGMA]
+        unfolded = [Details(figure.title, (figure,)) for figure in pictures if figure.title == OVER_SIGMA]
+        shown = *sentence, *at_once, *unfolded
+        chapters.append(Chapter(f"estimator-{i}", name, name, shown, _counts(named[name], verdict)))
     blocks = (
         *verdicts.judgement(study), *verdicts.bounds_tables(study), *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
@@ -261,7 +255,8 @@ def compose_files(
         Chapter("verdicts", "Verdict in figures", "Figures", blocks),
         Chapter("provenance", "What was read", "Files", (*read, Facts(facts(dict(manifest))))),
     ]
-    return Document(f"Estimator consistency: {title}", answer(judged), tuple(chapters))
+    words = badges([(name, verdict.status) for name, verdict in judged.items()])
+    return Document(f"Estimator consistency: {title}", answer(judged), tuple(chapters), badges=words)
 
 
 def answer(judged: Mapping[str, Verdict]) -> str:

@@ -6,6 +6,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from html import escape
+from itertools import groupby
 from pathlib import Path
 
 from consistency.referee.document.blocks import (
@@ -47,7 +48,9 @@ def render(document: Document, pictures: Pictures | None = None) -> str:
     page = Page(paint(document) if pictures is None else pictures)
     links = [f'<li><a href="#{escape(c.anchor)}">{escape(c.link)}</a></li>' for c in document.chapters if c.link]
     contents = f'<nav aria-label="Contents"><ul>{"".join(links)}</ul></nav>' if len(links) > 1 else ""
-    answer = f'<p class="answer">{_prose(document.answer)}</p>' if document.answer else ""
+    badges = " ".join(f"<span>{_cell(badge)}</span>" for badge in document.badges)
+    badges = f'<p class="badges">{badges}</p>' if badges else ""
+    answer = f'<div class="answer">{badges}<p>{_prose(document.answer)}</p></div>' if document.answer else ""
     title, script = escape(document.title), ""
     policy = "'none'"
     if any(chapter.switches for chapter in document.chapters):
@@ -94,7 +97,12 @@ class Page:
         return "\n".join(map(self._chapter, chapters))
 
     def blocks(self, blocks: Iterable[Block]) -> str:
-        return "\n".join(map(self._block, blocks))
+        """Blocks one below the other; figures that follow each other stand in two columns where there is room."""
+        parts = []
+        for is_figure, run in groupby(blocks, lambda block: isinstance(block, Figure)):
+            inside = "\n".join(filter(None, map(self._block, run)))
+            parts.append(f'<div class="figures">\n{inside}\n</div>' if is_figure and inside else inside)
+        return "\n".join(parts)
 
     def _chapter(self, chapter: Chapter) -> str:
         anchor, blocks = escape(chapter.anchor), self.blocks(chapter.blocks)

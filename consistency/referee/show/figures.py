@@ -90,26 +90,41 @@ def _matplotlib() -> ModuleType:
 
 
 def canvas(
-    height: float, columns: int = 1, panels: int = 1, *, width: float = WIDTH, **shared: Any
+    height: float, columns: int = 1, panels: int = 1, stacked: bool = False, *, width: float = WIDTH, **shared: Any
 ) -> tuple[Figure, list[Axes]]:
     """A figure with so many panels in rows of ``columns``, and their axes.
 
     Parameters
     ----------
     height, width : inches
+    stacked : the panels follow each other downwards, column by column
     **shared : of :meth:`matplotlib.figure.Figure.subplots`, such as ``sharex``
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height))
-    grid = figure.subplots(-(-panels // columns), columns, squeeze=False, **shared)
-    axes = list(grid.flat)
+    rows = -(-panels // columns)
+    grid = figure.subplots(rows, columns, squeeze=False, **shared)
+    axes = list(grid.T.flat if stacked else grid.flat)
     for empty_panel in axes[panels:]:
         empty_panel.set_axis_off()
     if shared.get("sharex"):  # a panel with none below it has numbers on its axis
         for number, panel in enumerate(axes[:panels]):
-            panel.tick_params(labelbottom=number + columns >= panels)
+            below = number + 1 if stacked and (number + 1) % rows else number + (panels if stacked else columns)
+            panel.tick_params(labelbottom=below >= panels)
     return figure, axes[:panels]
+
+
+def with_small_ones(height: float, many: int) -> tuple[Figure, list[Axes]]:
+    """A figure of one panel and so many square ones in two rows at its right, and their axes."""
+    from matplotlib.figure import Figure
+
+    figure, columns = Figure(figsize=(WIDTH, height)), -(-many // 2)
+    grid = figure.add_gridspec(2, 1 + columns, width_ratios=(2.0, *(1.0,) * columns))
+    engine: Any = figure.get_layout_engine()
+    engine.set(h_pad=0.14)  # of a panel beside two rows it leaves out the name of the axis
+    places = [grid[:, 0], *(grid[k % 2, 1 + k // 2] for k in range(many))]
+    return figure, [figure.add_subplot(place) for place in places]
 
 
 def rows_of(panels: int) -> int:
@@ -299,14 +314,6 @@ def add_legend(figure: Figure, beside: bool = False) -> Figure:
         options = {"loc": "outside upper left", "ncols": columns, "alignment": "left"}
     _write_labels(figure.legend(*_entries(found), **options), found, labels)
     return figure
-
-
-def panel_legend(axes: Axes) -> None:
-    """A legend inside one panel, where there is room."""
-    found = labelled([axes])
-    if found:
-        options: dict[str, Any] = {"fontsize": 5.5, "handlelength": 1.8, "labelspacing": 0.25, "borderpad": 0.2}
-        _write_labels(axes.legend(*_entries(found), **options), found, [wrapped(label, 30) for label in found])
 
 
 def labelled(panels: Sequence[Axes]) -> dict[str, Artist]:

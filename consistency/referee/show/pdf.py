@@ -35,7 +35,7 @@ def render_pdf(document: blocks.Document, pictures: Pictures | None = None) -> b
         folder = Path(name)
         removal = remove_at_stop(folder)
         paper = Paper(folder, paint(document) if pictures is None else pictures)
-        data = {part: paper.plain(getattr(document, part)) for part in ("title", "answer", "opening")}
+        data = {part: paper.plain(getattr(document, part)) for part in ("title", "badges", "answer", "opening")}
         data["chapters"] = paper.plain(document.paper)
         (folder / "data.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8")
         template = resources.files("consistency.referee.show").joinpath("templates").joinpath(TEMPLATE)

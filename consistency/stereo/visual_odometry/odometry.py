@@ -266,7 +266,7 @@ def sensitivities(rig: StereoRig, motions: Sequence[RelativeMotion], t: Array) -
 
 
 def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
-    """Shared errors and floor of highest likelihood (``uncertain_truth.fit_shared``).
+    """Shared errors and floor of highest likelihood (``uncertain_truth.fit_shared_error``).
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def fit_shared(errors: Array, J: Array, S: Array) -> SharedError:
     InputError
         Fewer than 12 motions, or shapes that do not fit.
     """
-    return uncertain_truth.fit_shared(errors, J, S, np.array(list(SHARED.values())))
+    return uncertain_truth.fit_shared_error(errors, J, S, np.array(list(SHARED.values())))
 
 
 def _by_rig(rig: StereoRig, motion: RelativeMotion) -> Array:

@@ -328,14 +328,18 @@ def test_evidence_is_drawn_with_its_threshold_and_alarm():
     threshold = watched.monitor.threshold
     axes = drawn(partial(monitor_drawing, watched)).axes[1]
     line = axes.lines[-1]
-    assert_array_equal(line.get_ydata(), watched.evidence[np.searchsorted(watched.t, line.get_xdata())])
-    assert line.get_ydata().max() == watched.evidence.max()
+    start = watched.t[0]
+    evidence = np.minimum(watched.evidence, threshold**3)  # beyond the drawn range
+    assert_array_equal(line.get_ydata(), evidence[np.searchsorted(watched.t - start, line.get_xdata())])
+    assert line.get_ydata().max() == evidence.max()
     assert [line.get_ydata()[0] for line in axes.lines if list(line.get_xdata()) == [0, 1]] == [threshold]
     assert axes.get_yscale() == "log"
     assert axes.get_ylim()[1] <= threshold**2 < watched.evidence.max()
     span = axes.patches[0]
-    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx((watched.since_t, watched.alarm_t))
-    assert [line for line in axes.lines if list(line.get_xdata()) == [watched.alarm_t] * 2]
+    assert (span.get_x(), span.get_x() + span.get_width()) == pytest.approx(
+        (watched.since_t - start, watched.alarm_t - start)
+    )
+    assert [line for line in axes.lines if list(line.get_xdata()) == [watched.alarm_t - start] * 2]
     quiet = watch(
         NisLog("f", np.arange(1.0, 6), np.full(5, np.nan), np.full(5, 3.0), np.full(5, 3.0)), make_monitor("optimal")
     )
@@ -364,9 +368,9 @@ def test_innovations_with_their_covariances(tmp_path):
 def test_the_plot_is_over_time_where_there_is_one():
     watched = changed()
     _, below = drawn(partial(monitor_drawing, watched)).axes
-    assert below.get_xlabel() == "t / s"
-    assert below.lines[-1].get_xdata()[-1] == pytest.approx(watched.t[-1])
-    assert below.lines[0].get_xdata()[0] == pytest.approx(watched.alarm_t)
+    assert below.get_xlabel() == "time from the start (s)"
+    assert below.lines[-1].get_xdata()[-1] == pytest.approx(watched.t[-1] - watched.t[0])
+    assert below.lines[0].get_xdata()[0] == pytest.approx(watched.alarm_t - watched.t[0])
     unknown = replace(watched, t=np.full(len(watched.t), np.nan))
     assert drawn(partial(monitor_drawing, unknown)).axes[1].get_xlabel() == "step"
 

@@ -146,7 +146,7 @@ def test_text_puts_what_did_not_pass_below_its_row():
 def test_a_static_page_shows_every_block_and_escapes_all_text():
     said = as_html.render(TREE)
     for part in (
-        "<h1>Two `filters`</h1>", '<p class="answer">One of them is honest.</p>',
+        "<h1>Two `filters`</h1>", '<div class="answer"><p>One of them is honest.</p></div>',
         '<span class="verdict consistent">consistent</span>',
         '<td class="number" data-head="n">2.00</td>', "too small &amp; skewed", "<li>x | y</li><li>z</li>",
         "<strong>Lead.</strong>",

@@ -29,7 +29,6 @@ from consistency.referee.show.figures import (
     make_map,
     name_rows,
     paint,
-    panel_legend,
     path,
     png,
     points,
@@ -243,11 +242,6 @@ def test_a_picture_that_scrolls_is_reached_by_the_keyboard():
     assert '<div class="chart" role="img" tabindex="0" aria-label="NEES">' in as_html.render(
         Document("", "", (), (figure,))
     )
-
-
-def test_a_panel_has_a_legend_of_its_own():
-    axes = axes_of(lambda axes: curve(axes, STEPS, STEPS, style(0), "$x$"), panel_legend)
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["$x$"]
 
 
 # --- files ------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.document.blocks import Details, Figure, Table, Text
+from consistency.referee.document.blocks import Details, Figure, Status, Table, Text
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, shown_run, unit_of
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.pages.write_pages import compose_files
@@ -52,9 +52,12 @@ def test_the_verdict_stands_on_top_and_the_pictures_first(archive):
     made = document(archive)
     sentence = cs.judge(cs.read(archive)).reasons[0]
     assert made.answer == f"mine is {sentence}."
-    assert [block.title for block in made.chapters[0].blocks] == [
-        "NEES", "Errors over their stated sigma", "Which run, and when", "Errors and stated bounds", "Coverage",
-    ]  # fmt: skip
+    assert made.badges == (Status(cs.judge(cs.read(archive)).status),)
+    *shown, on_demand = made.chapters[0].blocks
+    titles = ["NEES", "Errors and stated bounds", "Which run, and when", "Coverage"]
+    assert [block.title for block in shown] == titles
+    assert on_demand.summary == "Errors over their stated sigma"
+    assert [figure.title for figure in made.figures] == [*titles, "By axis", on_demand.summary]  # all are drawn
     assert [chapter.anchor for chapter in made.chapters] == ["estimator-0", "verdicts", "provenance"]
 
 
@@ -137,14 +140,14 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path, rng):
     record = read_recordings(tmp_path / "e.npz")[0]
     found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
     assert found[0].caption.startswith("NEES; 2 is expected")
-    assert legend_of(panels(found[1])[0].figure) == ["2 sigma", "run 0"]
+    assert legend_of(panels(found[1])[0].figure) == ["2-sigma bounds", "run 0"]
     assert [of.title for of in found] == [
         "NEES",
-        "Errors over their stated sigma",
         "Errors and stated bounds",
         "Coverage",
+        "Errors over their stated sigma",
     ]
-    assert legend_of(panels(found[2])[0].figure) == ["2-sigma bounds", "run 0"]
+    assert legend_of(panels(found[3])[0].figure) == ["2 sigma", "run 0"]
 
 
 def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
@@ -192,16 +195,18 @@ def test_runs_of_one_step_stand_side_by_side(tmp_path, rng):
 
 
 @pytest.mark.parametrize("steps", [1, STEPS])
-def test_every_panel_of_a_plot_has_a_legend(steps, tmp_path, rng):
+def test_a_plot_has_one_legend_outside_its_panels(steps, tmp_path, rng):
     np.savez(tmp_path / "e.npz", **{key: value[:, :steps] for key, value in errors_of(rng).items()})
     record = cs.read(tmp_path / "e.npz")
     unnamed = changed(record, axes=())
     for figure, many in ((record.plot(), 3), (unnamed.plot(), 3), (cs.judge(record).plot(), 4)):
-        legends = [axes.get_legend() for axes in figure.axes if axes.axison]
-        assert len(legends) == many
-        assert all(legends)
-        texts = [text.get_text() for text in legends[-1].get_texts()]
-        assert texts == ["expected", "axis 0", "axis 1", "all together"]
+        shown = [axes for axes in figure.axes if axes.axison]
+        assert len(shown) == many
+        assert not any(axes.get_legend() for axes in shown)
+        (legend,) = figure.legends
+        texts = [text.get_text() for text in legend.get_texts()]
+        assert len(set(texts)) == len(texts)
+        assert {"expected", "axis 0", "axis 1", "all together"} <= set(texts)
 
 
 def test_what_is_not_there_is_not_drawn(tmp_path, rng):

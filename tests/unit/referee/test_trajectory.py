@@ -39,8 +39,22 @@ def figure(one):
 
 
 def axes_of(one):
-    (axes,) = panels(figure(one))
-    return axes
+    """The panel of the whole path."""
+    return panels(figure(one))[0]
+
+
+def test_each_ellipse_is_drawn_from_near():
+    one = record()
+    whole, *close_ups = panels(figure(one))
+    steps = [int(axes.get_title("left").split()[-1]) - 1 for axes in close_ups]
+    assert steps[:2] == [10, 40]  # the worst first
+    outlines = lines(whole)[2:-1]
+    for axes, step, outline in zip(close_ups, steps, outlines, strict=True):
+        (low, high), places = axes.get_xlim(), outline.get_xydata()
+        assert low < places[:, 0].min() < places[:, 0].max() < high
+        assert np.ptp(places, axis=0).max() > 0.2 * (high - low)
+        assert low < one.origin.path[0, step, 0, 0] < high
+        assert axes.get_aspect() == 1.0
 
 
 def test_ellipses_stand_where_the_errors_are_largest():
@@ -110,7 +124,7 @@ def test_readers_keep_the_path_for_the_pictures(tmp_path):
     assert_allclose(one.origin.path[..., 0, :] - one.origin.path[..., 1, :], one.errors.error[..., :3], atol=1e-12)
     v = cs.judge(one)
     titles = [figure.title for figure in record_figures(one, v)]
-    assert titles == ["NEES", "Errors over their stated sigma", "Errors and stated bounds", "Trajectory", "Coverage"]
+    assert titles == ["NEES", "Errors and stated bounds", "Trajectory", "Coverage", "Errors over their stated sigma"]
     labels = [line.get_label() for axes in drawn(overview(one, v)).axes for line in axes.lines]
     assert {"truth", "estimate", "all together"} <= set(labels)
     assert one.of_runs(slice(0, 1)).origin.path is not None

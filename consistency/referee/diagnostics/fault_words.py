@@ -541,24 +541,9 @@ def level_causes(found: Findings) -> list[str]:
 
 
 def groups_text(by: ByGroup, is_fault: bool) -> str:
-    """The worst group where one is at fault, otherwise what is shown of the groups."""
-    if is_fault:
-        return _faults(by)
-    return _without_fault(by)
-
-
-def right_groups(v: Findings) -> str:
-    """What is shown of the groups of the whole, or of each part, where none is at fault."""
-    if v.by_group is not None:
-        return f"; {_without_fault(v.by_group)}"
-    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
-    return "".join(texts)
-
-
-def _faults(by: ByGroup) -> str:
-    """The worst group and those beside it, then where the covariance is shown to be right."""
+    """The worst group where one is at fault, those beside it, and where the covariance is right; or what is shown."""
+    if not is_fault:
+        return _without_fault(by)
     worst = by.worst
     others = [group for group in by.groups if group.status in SIDES and group is not worst]
     if len(others) == len(by.groups) - 1 > 1 and all(group.status == worst.status for group in others):
@@ -578,6 +563,16 @@ def _faults(by: ByGroup) -> str:
     if right:
         text += f"; consistent where {right}"
     return text
+
+
+def right_groups(v: Findings) -> str:
+    """What is shown of the groups of the whole, or of each part, where none is at fault."""
+    if v.by_group is not None:
+        return f"; {_without_fault(v.by_group)}"
+    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    if len(texts) > MOST:
+        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
+    return "".join(texts)
 
 
 def _without_fault(by: ByGroup) -> str:

@@ -328,7 +328,11 @@ def _is_ordered_by(values: Array, size: Array) -> bool:
     different = np.unique(values)
     if len(different) == 2:
         parts = sorted((np.sort(size[values == value]) for value in different), key=lambda part: float(part[0]))
-        return _is_threshold(*parts)
+        below, above = parts  # a threshold leaves no gap between them, as unlike sets have
+        if min(len(below), len(above)) < NEAR or above[0] < below[-1]:
+            return False
+        gaps = np.median(np.diff(below[-NEAR:])), np.median(np.diff(above[:NEAR]))
+        return bool(above[0] - below[-1] <= TIMES * min(gaps))
     if len(different) < FEWEST:
         return False
     some = np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(int)
@@ -341,11 +345,3 @@ def _goes_one_way(values: Array) -> bool:
     """Does a column only grow, or only fall, as the time and the way of one run do? So may the errors of a drift."""
     steps = np.diff(values)
     return bool((steps >= 0).all() or (steps <= 0).all())
-
-
-def _is_threshold(below: Array, above: Array) -> bool:
-    """Do two sets of sorted values meet at a threshold, without a gap as between unlike sets?"""
-    if min(len(below), len(above)) < NEAR or above[0] < below[-1]:
-        return False
-    gaps = np.median(np.diff(below[-NEAR:])), np.median(np.diff(above[:NEAR]))
-    return bool(above[0] - below[-1] <= TIMES * min(gaps))

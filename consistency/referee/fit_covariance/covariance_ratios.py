@@ -297,22 +297,19 @@ def record_of_motions(stretches: Sequence[Poses], axes: Sequence[str]) -> Record
 
 
 def write_motions(stretches: Sequence[Poses], folder: Path) -> list[str]:
-    """motions.csv and truth.csv in the plane, folders motions/ and truth/ of trajectories in space; their names."""
-    if stretches[0].d == 2:
-        _write_tables(stretches, folder)
-        return ["motions.csv", "truth.csv"]
-    for part in ("motions", "truth"):
-        (folder / part).mkdir()
-    for each in stretches:
-        file = f"{each.source.run:03d}-{str(each.source.files[0]).replace('/', '_')}.tum"
-        covariances = each.own.covariance.reshape(len(each.own.t), -1)
-        np.savetxt(folder / "motions" / file, np.column_stack([each.own.t, each.own.estimate, covariances]), DIGITS)
-        np.savetxt(folder / "truth" / file, np.column_stack([each.own.t, each.true.values]), DIGITS)
-    return ["motions", "truth"]
+    """motions.csv and truth.csv in the plane, folders motions/ and truth/ of trajectories in space; their names.
 
-
-def _write_tables(stretches: Sequence[Poses], folder: Path) -> None:
-    """Two tables, with a clock where all stretches have one."""
+    The tables have a clock where all stretches have one.
+    """
+    if stretches[0].d != 2:
+        for part in ("motions", "truth"):
+            (folder / part).mkdir()
+        for each in stretches:
+            file = f"{each.source.run:03d}-{str(each.source.files[0]).replace('/', '_')}.tum"
+            covariances = each.own.covariance.reshape(len(each.own.t), -1)
+            np.savetxt(folder / "motions" / file, np.column_stack([each.own.t, each.own.estimate, covariances]), DIGITS)
+            np.savetxt(folder / "truth" / file, np.column_stack([each.own.t, each.true.values]), DIGITS)
+        return ["motions", "truth"]
     motions, truth = [], []
     for each in stretches:
         keys = np.column_stack([np.full(len(each.own.t), each.source.run), np.arange(len(each.own.t)), each.own.t])
@@ -325,3 +322,4 @@ def _write_tables(stretches: Sequence[Poses], folder: Path) -> None:
         known = ~np.isnan(rows).any(axis=0)
         columns = ",".join(head[: len(known)][known])
         np.savetxt(folder / f"{name}.csv", rows[:, known], DIGITS, ",", header=columns, comments="")
+    return ["motions.csv", "truth.csv"]

@@ -666,7 +666,8 @@ def trajectory_panel(record: Record) -> tuple[str, Paint, tuple[Paint, ...]] | N
         if len(steps):
             axes.plot(*true[steps][:, pair].T, label="truth there", **dots(AT))
         for number, step in enumerate(steps, 1):
-            axes.annotate(str(number), true[step, pair], xytext=(4.0, 4.0), textcoords="offset points", weight="bold")
+            at = tuple(true[step, pair])
+            axes.annotate(str(number), at, xytext=(4.0, 4.0), textcoords="offset points", weight="bold")
         x, y = (record.errors.own_names.get(NAMES[axis], NAMES[axis]) for axis in pair)
         axes.set(xlabel=f"{x} (m)", ylabel=f"{y} (m)")
         make_map(axes)

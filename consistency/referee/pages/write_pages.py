@@ -16,7 +16,7 @@ import numpy as np
 from consistency.referee.diagnostics.number_words import plural, with_subject
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Chapter, Details, Document, Facts, Text, badges, number
+from consistency.referee.document.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
@@ -243,7 +243,7 @@ def compose_files(
         pictures = *bound_figures(verdict), *ratio_by_group_figure(verdict), *record_figures(named[name], verdict)
         at_once = [figure for figure in pictures if figure.title != OVER_SIGMA]
         unfolded = [Details(figure.title, (figure,)) for figure in pictures if figure.title == OVER_SIGMA]
-        shown = *sentence, *at_once, *unfolded
+        shown: tuple[Block, ...] = *sentence, *at_once, *unfolded
         chapters.append(Chapter(f"estimator-{i}", name, name, shown, _counts(named[name], verdict)))
     blocks = (
         *verdicts.judgement(study), *verdicts.bounds_tables(study), *questions_table.diagnosis(study), *by_axis(study),

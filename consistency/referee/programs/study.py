@@ -624,9 +624,17 @@ def opened_study(folder: Path, manifest: Mapping[str, Any], resume: bool) -> Ite
         folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder):
         if resume and is_program_runs(folder):
-            _require_same(study_in(folder), manifest)
+            before = study_in(folder).manifest
+            for key, what in SAME.items():
+                if before.get(key) != manifest.get(key):
+                    what = what.format(_changed(before.get(key), manifest.get(key)))
+                    raise InputError(f"--resume: {what} changed since the runs in {folder}; use --overwrite")
         else:
-            _clear(folder)
+            aside = folder / f".replaced-{os.getpid()}"  # another name first, so that none is taken for a new one
+            with writing(folder), suppress(FileNotFoundError):
+                (folder / "runs").rename(aside)
+            for old in folder.glob(".replaced-*"):
+                shutil.rmtree(old, ignore_errors=True)
         with writing(folder):
             (folder / "runs").mkdir(exist_ok=True)
             study = ProgramStudy(folder, write_manifest(folder, manifest))
@@ -658,23 +666,6 @@ def _locked(folder: Path) -> Iterator[None]:
         except OSError:
             raise InputError(f"--out {folder}: another 'consistency monte-carlo' works on it") from None
         yield
-
-
-def _clear(folder: Path) -> None:
-    """Remove runs of an earlier study; their folder has another name first, so that none is taken for a new one."""
-    aside = folder / f".replaced-{os.getpid()}"
-    with writing(folder), suppress(FileNotFoundError):
-        (folder / "runs").rename(aside)
-    for old in folder.glob(".replaced-*"):
-        shutil.rmtree(old, ignore_errors=True)
-
-
-def _require_same(before: ProgramStudy, manifest: Mapping[str, Any]) -> None:
-    """Refuse to resume another study."""
-    for key, what in SAME.items():
-        if before.manifest.get(key) != manifest.get(key):
-            what = what.format(_changed(before.manifest.get(key), manifest.get(key)))
-            raise InputError(f"--resume: {what} changed since the runs in {before.folder}; use --overwrite")
 
 
 def _changed(old: Any, new: Any) -> str:

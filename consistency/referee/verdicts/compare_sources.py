@@ -346,7 +346,10 @@ def read_baseline(path: Path, skip: str | float | Skip | None = None) -> Baselin
             raise ValueError("key 'origin': not a list of two")
         if not isinstance(data["filters"], dict):
             raise ValueError("key 'filters': not a table")
-        trials = _trials_of(data.get("trials", {}))  # files written before lack it
+        of_runs = data.get("trials", {})  # files written before lack it
+        if not isinstance(of_runs, dict) or not all(isinstance(trial, str) for trial in of_runs.values()):
+            raise ValueError("key 'trials': not a table of texts")
+        trials = {int(run): trial for run, trial in of_runs.items()}
         rows = {name: _filter_of(row, f"filters.{name}") for name, row in data["filters"].items()}
     filters = {}
     failures = {}
@@ -379,7 +382,12 @@ def require_skip(base: Baseline, skip: str | float | Skip | None) -> Baseline:
 
 def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]]:
     """One filter in the file, values of R runs: a summary as the referee takes it, failed runs, names of components."""
-    _known(table, place, FILTER_KEYS, optional=("axes",))  # files written before lack it
+    if not isinstance(table, dict):
+        raise ValueError(f"key '{place}': not a table")
+    if missing := [key for key in FILTER_KEYS if key not in table]:
+        raise ValueError(f"key '{place}.{missing[0]}': missing")
+    if unknown := [key for key in table if key not in (*FILTER_KEYS, "axes")]:  # files written before lack axes
+        raise ValueError(f"key '{place}.{unknown[0]}': unknown")
     runs = _list(table["runs"], f"{place}.runs")
     for k, run in enumerate(runs):
         _whole(run, f"{place}.runs.{k}", 0, 2**63)
@@ -399,23 +407,6 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
         axes = list(numbered_axes(len(axes)))
     failures = _whole(table["failures"], f"{place}.failures", 0)
     return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
-
-
-def _trials_of(table: Any) -> dict[int, str]:
-    """What each run was made of, by run."""
-    if not isinstance(table, dict) or not all(isinstance(trial, str) for trial in table.values()):
-        raise ValueError("key 'trials': not a table of texts")
-    return {int(run): trial for run, trial in table.items()}
-
-
-def _known(table: Any, place: str, keys: Sequence[str], optional: Sequence[str] = ()) -> None:
-    """Refuse what is not a table of these keys and no others."""
-    if not isinstance(table, dict):
-        raise ValueError(f"key '{place}': not a table")
-    if missing := [key for key in keys if key not in table]:
-        raise ValueError(f"key '{place}.{missing[0]}': missing")
-    if unknown := [key for key in table if key not in (*keys, *optional)]:
-        raise ValueError(f"key '{place}.{unknown[0]}': unknown")
 
 
 def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from consistency.referee.defaults import GATE_FALSE_ALARM
 from consistency.referee.diagnostics.monitor import Alarm, Monitor
 from consistency.referee.diagnostics.record import Skip
 from consistency.referee.errors import InputError
@@ -45,7 +45,13 @@ class Watched:
     evidence: Array  # (N,), e-value after each step
 
 
-def make_monitor(innovations: str | None, gate: str | float | None = None, **options: Any) -> Monitor:
+def make_monitor(
+    innovations: str | None,
+    gate: str | float | None = None,
+    false_alarm: float = GATE_FALSE_ALARM,
+    tolerance: float = 1.2,
+    mission: int | None = None,
+) -> Monitor:
     """A monitor by the options of the command; ``innovations`` must declare them to be those of an optimal gain.
 
     Parameters
@@ -71,7 +77,7 @@ def make_monitor(innovations: str | None, gate: str | float | None = None, **opt
     except ValueError:
         raise InputError(f"--gate {gate}: must be a probability, such as 99% or 0.99") from None
     try:
-        return Monitor(gate=share, **options)
+        return Monitor(false_alarm, tolerance, share, mission)
     except ValueError as error:
         name, rest = str(error).split(" ", 1)
         raise InputError(f"--{name.replace('_', '-')} {rest}") from None

@@ -15,7 +15,7 @@ from consistency.referee.readers.mix_ups.hints import hints
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.referee.readers.truth_matching import BRIDGED, truth_at
-from consistency.referee.verdicts.compare_sources import _known
+from consistency.referee.verdicts.compare_sources import FILTER_KEYS, _filter_of
 
 
 def test_a_table_has_the_errors_that_were_written(tmp_path):
@@ -114,7 +114,7 @@ def test_a_quoted_row_with_too_few_fields(tmp_path):
 
 def test_an_unknown_key_of_a_baseline():
     with pytest.raises(ValueError, match=r"key 'filters\.a\.more': unknown"):
-        _known({"runs": [], "more": 1}, "filters.a", ("runs",))
+        _filter_of(dict.fromkeys(FILTER_KEYS, 1) | {"more": 1}, "filters.a")
 
 
 def test_no_run_needs_no_hint():

@@ -429,6 +429,14 @@ def test_first_poses_are_made_true(kind, convention, rng):
     assert_allclose(np.linalg.det(back.own.covariance[1:]), np.linalg.det(p.own.covariance[1:]), rtol=1e-6)
 
 
+def test_a_first_pose_adds_to_the_last_components_alone(rng):
+    p = run_of(rng, "spatial", "so3")
+    (back,) = aligned("est", [p], "origin", [3, 4, 5]).runs
+    own, wide = (each.own.covariance[1:] for each in (p, back))  # in worlds that are turned against each other
+    assert (np.linalg.det(wide[:, 3:, 3:]) > np.linalg.det(own[:, 3:, 3:])).all()
+    assert_allclose(np.linalg.det(wide[:, :3, :3]), np.linalg.det(own[:, :3, :3]))
+
+
 @pytest.mark.parametrize("kind, convention", KINDS)
 def test_what_an_uncertain_first_pose_adds_is_bounded(kind, convention, rng):
     """e_k - J e_0: J by numbers; the bound is exact for none, and holds for errors that are opposite throughout."""

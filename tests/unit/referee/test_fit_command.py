@@ -105,9 +105,9 @@ def test_a_window_that_is_left_out_begins_another_run(rng, tmp_path):
 
 def test_motions_without_a_clock_have_no_column_of_it(planar, tmp_path):
     stretches = planar.stretches
-    for name, t in (("clock", stretches[0].t), ("none", np.full(len(stretches[0].t), np.nan))):
+    for name, t in (("clock", stretches[0].own.t), ("none", np.full(len(stretches[0].own.t), np.nan))):
         (tmp_path / name).mkdir()
-        write_motions([replace(stretches[0], t=t)], tmp_path / name)
+        write_motions([stretches[0].with_values(t=t)], tmp_path / name)
         head, first = (tmp_path / name / "motions.csv").read_text().splitlines()[:2]
         assert head.startswith("run,step,t,x,y,heading,P_" if name == "clock" else "run,step,x,y,heading,P_")
         assert head.count(",") == first.count(",")
@@ -211,7 +211,7 @@ def test_an_axis_that_never_moved_has_a_covariance_in_each_export(rng, tmp_path)
     L = np.array(ceres(model).split("{")[1].split("}")[0].replace(",", " ").split(), float).reshape(6, 6)
     assert_allclose(np.diag(np.linalg.inv(L.T @ L))[2:5], n.floor[2:5], rtol=1e-6)
     for stretch in model.stretches:
-        assert (np.linalg.eigvalsh(stretch.covariance[1:]) > 0).all()
+        assert (np.linalg.eigvalsh(stretch.own.covariance[1:]) > 0).all()
     snippet = gtsam(model)
     assert all(f"{each:.17g}" in snippet for each in n.floor)
 

@@ -59,6 +59,8 @@ def test_matched_estimates_stand_beside_their_truth(rng):
     assert_allclose(found.true.values, p.true.values[::2][:37], atol=1e-12)
     assert_array_equal(found.true.covariance[:, 0, 0], np.arange(0, 74, 2))
     assert_allclose(found.errors(), p.errors()[:37], rtol=0, atol=1e-15)
+    clocks = p.with_values(true_clock=5.0 + p.true.t).matched().true.clock
+    assert_allclose(clocks, 5.0 + found.own.t, atol=1e-12)  # that of the sample beside each estimate
     assert found.own.place[5] == "line 5"
     later = p.matched(0.05)
     assert_allclose(later.true.values, p.true.values[1::2], atol=1e-12)

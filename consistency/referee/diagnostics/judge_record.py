@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from consistency.referee.diagnostics.nees import e_processes, ever
 from consistency.referee.diagnostics.record import Record
@@ -68,7 +68,7 @@ def judge(
     if record.errors.bounds:
         from consistency.referee.diagnostics.bounds import findings_of_bounds
 
-        return replace(_whole(record, findings_of_bounds(record, settings)), record=kept)
+        return _whole(record, findings_of_bounds(record, settings), record=kept)
     evidence = record.as_runs
     truth = None
     unshown = record.origin.unshown
@@ -89,24 +89,20 @@ def judge(
     if record.world is not None:
         in_world = findings_of(record.in_world, settings)
         world = _verdict(in_world, reasons(in_world))
-    return replace(
-        _whole(record, found),
-        world=world,
-        map=_map_of(record, settings),
-        rejection=_rejections_of(record),
-        record=kept,
+    return _whole(
+        record, found, world=world, map=_map_of(record, settings), rejection=_rejections_of(record), record=kept
     )
 
 
-def _verdict(found: Findings, sentences: Sequence[str]) -> Verdict:
-    """The findings with the ``sentences`` that say them."""
+def _verdict(found: Findings, sentences: Sequence[str], **beside: Any) -> Verdict:
+    """The findings with the ``sentences`` that say them, and what stands ``beside`` them."""
     fields = vars(found) | {"parts": {name: _verdict(part, reasons(part)) for name, part in found.parts.items()}}
     fields |= {"reasons": tuple(sentences), "details": tuple(details(found)), "axis": deciding_axis(found)}
-    return Verdict(**fields)
+    return Verdict(**fields | beside)
 
 
-def _whole(judged: Record, found: Findings) -> Verdict:
-    """The verdict on a record: its findings in words, and what its reader said of it."""
+def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
+    """The verdict on a record: its findings in words, and what stands beside its errors and innovations."""
     sentence, *figures = reasons(found)
     if judged.fit.caption:
         sentence = f"{sentence}; {judged.fit.caption}"
@@ -118,14 +114,15 @@ def _whole(judged: Record, found: Findings) -> Verdict:
     if judged.fit.align:
         left_out.update(judged.left_out_steps)
     causes = (*judged.origin.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
-    sentences = [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)]
-    return replace(
-        _verdict(found, sentences),
+    return _verdict(
+        found,
+        [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)],
         left_out_steps=tuple(sorted(left_out)),
         convention=convention,
         align=align,
         notes=tuple(judged.origin.notes),
         causes=causes,
+        **beside,
     )
 
 
@@ -325,12 +322,8 @@ def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept:
             of_world, fit=replace(of_world.fit, caption=""), origin=replace(of_world.origin, causes=(), notes=())
         )
         world, _ = follow(design, errors.first_runs, runs)
-    return replace(
-        _whole(evidence, found),
-        world=world,
-        map=_map_of(evidence),
-        rejection=_rejections_of(evidence, runs),
-        record=kept,
+    return _whole(
+        evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs), record=kept
     )
 
 

@@ -301,7 +301,7 @@ OPTIONS = (  # those that users give, in the order in which the command line sho
         flag="--gaussian/",
     ),
     Option("ends", "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."),
-    Option("by", "Judge groups by this column, too: bins, or words; since:TOPIC of a bag.", "COLUMN"),
+    Option("by", "Judge groups by this column, too, or since:TOPIC.", "COLUMN"),
     Option("by_file", "Table with that column and t, run or both."),
     Option("bins", "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins),
     Option(

@@ -19,6 +19,7 @@ from calibration_monitor import Position, Velocity
 
 import consistency as cs
 from consistency.referee.diagnostics.monitor import gate_limit, gate_share, rest_after_rejection
+from consistency.referee.fit_covariance.correct import Correction
 from consistency.referee.types import Array
 
 GATES, QUICK_GATES = 2000, 60
@@ -67,6 +68,7 @@ def found_status(rng: np.random.Generator, rows: int, mixed: bool) -> tuple[str,
     if mixed:
         errors[1::2] *= MIXED
     found = cs.correct(errors, independent=True)
+    assert isinstance(found, Correction)
     return found.status, bool(found.verdict.faults)
 
 

@@ -405,8 +405,7 @@ def challenge_command(
 
 def list_command(as_json: AsJson = False) -> None:
     """List scenarios, filters, experiments and sweeps."""
-    from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
-    from consistency.bench.filters.guard import KINDS
+    from consistency.bench.filters import BOUNDS, GUARDS, SMOOTHERS, filter_summaries
     from consistency.referee.system.folders import summaries
 
     shipped, filters = summaries(), filter_summaries()
@@ -414,11 +413,11 @@ def list_command(as_json: AsJson = False) -> None:
         print(f"consistency: to run what is listed needs {remedy('bench')}", file=sys.stderr)
     if as_json:
         listed = {"scenarios": shipped.pop("scenarios"), "filters": list(filters)}
-        print(json.dumps(listed | shipped | {"filter_summaries": filters, "guards": KINDS}, indent=2))
+        print(json.dumps(listed | shipped | {"filter_summaries": filters, "guards": GUARDS}, indent=2))
         return
     marks = dict.fromkeys(BOUNDS, " (not realisable)") | dict.fromkeys(SMOOTHERS, " (all data at once)")
     marked = {name: text + marks.get(name, "") for name, text in filters.items()}
-    guards = {f"FILTER+{kind}": text for kind, text in KINDS.items()}
+    guards = {f"FILTER+{kind}": text for kind, text in GUARDS.items()}
     named = {
         **{kind.capitalize(): texts for kind, texts in shipped.items()},
         "Filters": marked,

@@ -10,13 +10,14 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
+from consistency.bench.filters import GUARDS
 from consistency.bench.filters import compiled_guard as kernel_guard
 from consistency.bench.filters import guard as plain_guard
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiled_guard import guard_part, keep_agreeing
 from consistency.bench.filters.compiler.jit import Kernel
 from consistency.bench.filters.filter_declarations import problem_of
-from consistency.bench.filters.guard import KINDS, kept_observations, limits_of
+from consistency.bench.filters.guard import kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_guard_arrays
 from consistency.bench.filters.run_filter import step_through
@@ -93,7 +94,7 @@ def by_kernel(kind, step):
     return np.array(watch.kept)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", GUARDS)
 def test_decisions_are_those_of_the_definitions(kind, rng):
     sizes = set()
     for _ in range(150):

@@ -23,8 +23,7 @@ from documents import PAGES, PROGRAMS, ROOT, SHELL, blocks, commands, parsed, re
 
 import consistency as cs
 from consistency.bench.challenging.world_space import space_of
-from consistency.bench.filters import filter_names
-from consistency.bench.filters.guard import KINDS
+from consistency.bench.filters import GUARDS, filter_names
 from consistency.bench.runs.reproduce_findings import experiments
 from consistency.bench.scenario import data_folder, scenario_names
 from consistency.bench.sweeps.sweep_file import load_sweep, sweep_names
@@ -88,7 +87,7 @@ def test_the_command_line_takes_it(command):
 
 def names_exist(name, values):
     """Filters, scenarios, sweeps and findings, unless a placeholder or a file stands for them."""
-    filters = [*filter_names(), *(f"{one}+{kind}" for one in filter_names() for kind in KINDS)]
+    filters = [*filter_names(), *(f"{one}+{kind}" for one in filter_names() for kind in GUARDS)]
     named = {"scenario": scenario_names(), "rig": scenario_names(), "filters": filters, "filter_name": filters}
     named |= {"only": findings()} | ({"source": sweep_names()} if name == "sweep" else {})
     if name in ("analyse", "compare", "monitor"):  # their filters are those of a file

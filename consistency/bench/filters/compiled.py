@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from consistency.bench.filters import GUARDS
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiled_guard import guard_part
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.filter_declarations import is_realisable, problem_for
-from consistency.bench.filters.guard import KINDS, Guarded
+from consistency.bench.filters.guard import Guarded
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.filters.kernel.update_steps import REASONS
@@ -173,8 +174,8 @@ def guarded(filter_: Filter, kind: str) -> Any:
     'ekf-uvd+gate'
     """
     name = getattr(filter_, "name", type(filter_).__name__)
-    if kind not in KINDS:
-        raise InputError(f"filter '{name}': unknown guard '{kind}'; known: {', '.join(KINDS)}")
+    if kind not in GUARDS:
+        raise InputError(f"filter '{name}': unknown guard '{kind}'; known: {', '.join(GUARDS)}")
     if isinstance(filter_, Guarded) or isinstance(getattr(filter_, "textbook", None), Guarded):
         raise InputError(f"filter '{name}' has a guard already; it may have one")
     if getattr(filter_, "innovates", True) is False:

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from consistency.bench.filters import GUARDS
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.filters.guard import KINDS, MOST_NODES, limits_of
+from consistency.bench.filters.guard import MOST_NODES, limits_of
 from consistency.bench.filters.kernel.part_functions import (
     Data,
     Slam,
@@ -212,7 +213,7 @@ def _list_support(
     return found
 
 
-JOINT, RANSAC = list(KINDS).index("joint"), list(KINDS).index("ransac")
+JOINT, RANSAC = list(GUARDS).index("joint"), list(GUARDS).index("ransac")
 
 
 @part()
@@ -232,7 +233,7 @@ class Guard(NamedTuple):
 def guard_part(kind: str, settings: GuardSettings, s: int, m: int) -> Guard:
     """A guard of up to ``m`` landmarks in a step, each with ``s`` values."""
     limits = limits_of(settings, s, m)
-    return Guard(list(KINDS).index(kind), settings.min_age, settings.forget_after or 0, limits.joint, limits.support)
+    return Guard(list(GUARDS).index(kind), settings.min_age, settings.forget_after or 0, limits.joint, limits.support)
 
 
 @implement(make_guard_arrays, Guard)

@@ -34,11 +34,6 @@ from consistency.referee.types import Array, Indices
 MOST_NODES = 2000  # of the search for a joint set; some 2 ms in a kernel. Below it the set is the largest
 DECLARED = ("sensors", "needs", "error", "realisable", "uvd")  # of a filter, that its guarded form declares as well
 ASKED = ("map", "joint", "own_covariance")  # optional methods of a state
-KINDS = {
-    "gate": "chi-square gate of each observation by its own innovation",
-    "joint": "largest set of observations that is jointly compatible",
-    "ransac": "one-point RANSAC: the observations that agree with the best hypothesis from one of them",
-}
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,13 @@ import numpy as np
 
 from consistency.referee.types import Array, Failure, Indices
 
+# guards, which say which observations a filter is given
+GUARDS = {
+    "gate": "chi-square gate of each observation by its own innovation",
+    "joint": "largest set of observations that is jointly compatible",
+    "ransac": "one-point RANSAC: the observations that agree with the best hypothesis from one of them",
+}
+
 
 @dataclass(frozen=True)
 class Gaussian:

@@ -405,7 +405,8 @@ def challenge_command(
 
 def list_command(as_json: AsJson = False) -> None:
     """List scenarios, filters, experiments and sweeps."""
-    from consistency.bench.filters import BOUNDS, GUARDS, SMOOTHERS, filter_summaries
+    from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
+    from consistency.bench.types import GUARDS
     from consistency.referee.system.folders import summaries
 
     shipped, filters = summaries(), filter_summaries()

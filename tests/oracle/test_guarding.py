@@ -10,7 +10,6 @@ from mismatch import corrupted
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters import GUARDS
 from consistency.bench.filters import compiled_guard as kernel_guard
 from consistency.bench.filters import guard as plain_guard
 from consistency.bench.filters.compiled import Compiled
@@ -22,7 +21,7 @@ from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_guard_arrays
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.scenario import GuardSettings
-from consistency.bench.types import Observation
+from consistency.bench.types import GUARDS, Observation
 
 SETTINGS = GuardSettings(confidence=0.95, threshold=1.5)
 

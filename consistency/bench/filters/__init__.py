@@ -14,12 +14,6 @@ from typing import Any
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 
-# guards, which say which observations a filter is given
-GUARDS = {
-    "gate": "chi-square gate of each observation by its own innovation",
-    "joint": "largest set of observations that is jointly compatible",
-    "ransac": "one-point RANSAC: the observations that agree with the best hypothesis from one of them",
-}
 DATA = {
     "xyz": "on points",
     "uvd": "on pixels",

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from consistency.bench.filters import GUARDS
 from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiled_guard import guard_part
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
@@ -25,7 +24,7 @@ from consistency.bench.filters.parts.local import LOCAL_FROM, Local
 from consistency.bench.filters.parts.parking import Parking
 from consistency.bench.protocols import Filter, Problem
 from consistency.bench.scenario import Belief, GuardSettings
-from consistency.bench.types import Estimates, Map, Trial
+from consistency.bench.types import GUARDS, Estimates, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE
 from consistency.referee.types import Array, Failure

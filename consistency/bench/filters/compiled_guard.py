@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from consistency.bench.filters import GUARDS
 from consistency.bench.filters.compiler.dispatch import implement, part
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.guard import MOST_NODES, limits_of
@@ -27,6 +26,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.kernel.update_steps import INNOVATION, Scratch
 from consistency.bench.scenario import GuardSettings
+from consistency.bench.types import GUARDS
 from consistency.referee.types import Array, Indices
 
 

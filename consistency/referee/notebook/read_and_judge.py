@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.words.numbers import plural
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import document, summary
 from consistency.referee.errors import InputError, naming_arguments
-from consistency.referee.readers.formats.archives import UNWEIGHTED
+from consistency.referee.readers.formats.members import UNWEIGHTED
 from consistency.referee.readers.options import OPTIONS, Reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_statement
 from consistency.referee.readers.pipeline.by_column import with_groups

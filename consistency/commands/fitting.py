@@ -149,7 +149,7 @@ def correct_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Find factors for stated covariances or bounds, or variances where none is. Judge them on held-out runs."""
+    """Find factors for what is stated, or variances where nothing is. Judge them on held-out runs."""
     from dataclasses import replace
 
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.verdict.parts import Interval
 from consistency.referee.diagnostics.verdict.verdict import Verdict, plain
 from consistency.referee.diagnostics.words.bounds import factor_text, level_text
 from consistency.referee.diagnostics.words.numbers import percent, plural, short
-from consistency.referee.document.blocks import Column, Document, Text, table
+from consistency.referee.document.blocks import Block, Column, Document, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, fitted_and_judged, require_fixed_groups
 from consistency.referee.types import Array
@@ -171,7 +171,7 @@ def bound_correction_document(found: BoundCorrection) -> Document:
     columns = tuple(Column(head) for head in heads[not has_groups :])
     text = "a new run is expected to leave a corrected bound in at most 1 - level of its steps, if it is like these"
     notes = [each.note for each in found.factors if each.note]
-    blocks = (
+    blocks: tuple[Block, ...] = (
         Text(f"{found.name}: {found.sentence}"), table(columns, rows, "Factors of each bound", style="plain"),
         *map(Text, notes), Text(text),
     )  # fmt: skip

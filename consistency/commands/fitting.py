@@ -147,7 +147,7 @@ def correct_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a folder of --out.")] = False,
 ) -> None:
-    """Find factors for covariances or bounds, or a covariance. Judge them on held-out runs."""
+    """Find factors for what is stated, or variances where nothing is. Judge them on held-out runs."""
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
     from consistency.referee.fit_covariance.correct_bounds import BoundCorrection, bound_correction_document
     from consistency.referee.readers.formats.restated import text_files

@@ -18,7 +18,7 @@ from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
 from consistency.referee.document.tables import document, summary_blocks
 from consistency.referee.errors import InputError, naming_arguments
-from consistency.referee.readers.formats.archives import UNWEIGHTED
+from consistency.referee.readers.formats.members import UNWEIGHTED
 from consistency.referee.readers.options import (
     OPTIONS,
     ComponentOptions,

@@ -56,6 +56,7 @@ QUALITY = re.compile(
 COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns beside the state
 ADVICE = re.compile(r"\badd (--[a-z-]+) ([^\s;()]+)")  # in a note of a reader
 OF_DRIVES = {"truth", "topic", "truth_topic", "columns", "truth_columns"}  # options of 'fit-covariance', too
+FAR, DRIFTS = 4, 2.0  # rows, and growth of squared differences from which errors are taken to last, as of odometry
 DEEPEST, MOST = 4, 4  # options that are added one after the other; candidates for one of them
 LARGE = 1e6  # a variance from which on it says that nothing is known
 UNLIKE = 100.0  # ratio of two deviations of one unit
@@ -355,10 +356,17 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
     if not tried.found and (r.sources.truth or r.sources.truth_topic) and set(r.given()) <= OF_DRIVES:
         with suppress(InputError):
             found = kind.read(path, read_files.checked_options(r), True)
+            facts = (*facts, *Attempt(r, {}, found).facts)
+            rows = _attempt(path, r.with_options(unstated=True, independent=True), {})
+            if not rows.refusal and all(map(_is_of_rows, _attempt(path, r.with_options(unstated=True), {}).records)):
+                why.append(("--independent", "errors of neighbouring rows differ as much as those of rows far apart"))
+                note = f"{tried.refusal}; if the estimator has one, write it; 'correct' finds one, judged row by row"
+                command = _command("correct", path, r.with_options(independent=True))
+                return Inspection(path, kind.name, facts, (note,), tuple(why), command)
             why.append(("--span", "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"))
             note = f"{tried.refusal}; if the estimator has one, write it; 'fit-covariance' finds one for its motions"
             command = _command("fit-covariance", path, r, ("--span", "1m"))
-            return Inspection(path, kind.name, (*facts, *Attempt(r, {}, found).facts), (note,), tuple(why), command)
+            return Inspection(path, kind.name, facts, (note,), tuple(why), command)
     notes = ("by its name it is the truth; inspect the estimates",) if TRUTH.search(path.stem) else ()
     if not tried.found and r.sources.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts
         own = _attempt(path, r.with_truth(path), {}).facts
@@ -367,6 +375,15 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
     if "--truth FILE" in missing and not notes:
         missing += f"; what to run then says: {_command('inspect', path, r, ('--truth', 'FILE'))}"
     return Inspection(path, kind.name, facts, notes, tuple(why), missing=missing)
+
+
+def _is_of_rows(record: Record) -> bool:
+    """Whether errors of rows are independent, as of detections: hardly farther apart over four rows than over one."""
+    e = record.errors.error
+    if e is None or e.shape[1] <= FAR:
+        return False
+    near, far = (np.nanmean(np.square(e[:, rows:] - e[:, :-rows]), axis=(0, 1)) for rows in (1, FAR))
+    return bool((far < DRIFTS * near).all())
 
 
 def _innovations(path: Path, r: Reading, kind: str, facts: Pairs = (), choice: Mapping[str, Any] = {}) -> Inspection:

@@ -266,14 +266,27 @@ def test_clocks_that_differ_are_found_and_added(tmp_path):
     assert "clocks" in dict(found.options)["--time-offset"]
 
 
-def test_poses_without_covariances_get_the_command_that_fits_them(tmp_path, capsys):
-    own, true = tum(np.random.default_rng(1), stated=False)
-    np.savetxt(tmp_path / "wheels.tum", own)
-    np.savetxt(tmp_path / "truth.tum", true)
-    out, _ = consistency(capsys, "inspect", tmp_path / "wheels.tum")
-    assert out.splitlines()[-1].startswith("  consistency fit-covariance ")
-    assert out.splitlines()[-1].endswith("--span 1m")
+@pytest.mark.parametrize("drifts, line", [(False, "correct {} --independent"), (True, "fit-covariance {} --span 1m")])
+def test_poses_without_covariances_get_the_command_that_fits_them(tmp_path, capsys, drifts, line):
+    rng = np.random.default_rng(1)
+    k = np.arange(300)
+    (tmp_path / "est").mkdir()
+    (tmp_path / "true").mkdir()
+    for run in range(4):
+        steps = rng.normal(size=(300, 3)) * [0.02, 0.02, 0.004]
+        e = steps.cumsum(axis=0) if drifts else steps
+        heading = 0.02 * k + run
+        at = np.column_stack([np.cumsum(0.3 * np.cos(heading)), np.cumsum(0.3 * np.sin(heading)), heading])
+        for folder, pose in (("true", at), ("est", at - e)):
+            half = 0.5 * pose[:, 2:]
+            lines = [0.1 * k[:, None], pose[:, :2], np.zeros((300, 3)), np.sin(half), np.cos(half)]
+            np.savetxt(tmp_path / folder / f"{run}.txt", np.hstack(lines))
+    words = (tmp_path / "est", "--truth", tmp_path / "true")
+    out, _ = consistency(capsys, "inspect", *words)
+    assert out.splitlines()[-1] == "  consistency " + line.format(" ".join(map(str, words)))
     assert "none is stated" in out
+    if not drifts:
+        consistency(capsys, *shlex.split(out.splitlines()[-1])[1:])  # runs as it stands
 
 
 def test_covariances_that_are_no_filters_are_named(tmp_path):

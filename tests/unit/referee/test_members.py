@@ -391,6 +391,7 @@ TABLE = "run,step,true_x,true_y,a1,a2,b1\n0,1,0,0,1,2,3\n0,2,0,0,1,2,3\n"
 
 @pytest.mark.parametrize("table, members, message", [
     (TABLE, {"x": "a*", "y": "b*"}, "m.csv: members: .*x 2, y 1"),
+    (TABLE.replace("b1", "weight"), {"x": "a*"}, "m.csv: column 'weight' .*draw members of equal weight"),
     (TABLE, {"x": "q*"}, "m.csv: members=.*x=q.*a1"),
     (TABLE.replace("0,2,0,0,1,2", "0,2,0,0,1,"), {"x": "a*"}, "m.csv, line 3: member 2 of 2"),
 ])  # fmt: skip

@@ -24,6 +24,7 @@ from consistency.referee.diagnostics.record import (
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import INERTIAL, PLANAR, state_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
+from consistency.referee.readers.formats.members import UNWEIGHTED
 from consistency.referee.readers.formats.pose_rows import are_rotations, quaternions
 from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof, checked_dof
 from consistency.referee.readers.formats.text_blocks import bounded
@@ -59,10 +60,6 @@ UNLIKE = 0.2  # of it, from step to step
 KINDS = (
     "errors and covariances; or errors and bounds; or estimates, truth and covariances; or members and truth; or nees "
     "and dof"
-)
-UNWEIGHTED = (
-    "ranks among weighted members are not uniform (3 % of those of a right filter lie beyond its 1 %); draw members of "
-    "equal weight from all particles, far fewer than are effective, and give these"
 )
 HDF5 = b"MATLAB 7.3"  # begin of a file that SciPy does not read
 AXES = {

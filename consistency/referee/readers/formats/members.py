@@ -16,6 +16,12 @@ from consistency.referee.readers.options import Reading
 from consistency.referee.readers.truth_matching import ALONE, Estimator
 from consistency.referee.types import Array
 
+WEIGHTS = ("w", "weight", "weights")  # names of columns
+UNWEIGHTED = (
+    "ranks among weighted members are not uniform (3 % of those of a right filter lie beyond its 1 %); draw members of "
+    "equal weight from all particles, far fewer than are effective, and give these"
+)
+
 
 def checked_members(members: Array, known: Array, place: Callable[[int], str]) -> Array:
     """Members (k, m, n), NaN in all of them where a step has none.
@@ -85,6 +91,9 @@ def member_columns(sheet: TableRows, names: Mapping[str, str]) -> Array:
     InputError
         No column begins so, components have members of unlike number, or some members of a row are empty.
     """
+    weights = next((column for column in sheet.data if column in WEIGHTS and column not in names), None)
+    if weights is not None:
+        raise InputError(f"{sheet.path}: column '{weights}' beside --members: {UNWEIGHTED}; leave the column out then")
     found = {}
     for axis, pattern in names.items():
         begin = pattern.rstrip("*")

@@ -23,10 +23,11 @@ from documents import PAGES, PROGRAMS, ROOT, SHELL, blocks, commands, parsed, re
 
 import consistency as cs
 from consistency.bench.challenging.world_space import space_of
-from consistency.bench.filters import GUARDS, filter_names
+from consistency.bench.filters import filter_names
 from consistency.bench.runs.reproduce_findings import experiments
 from consistency.bench.scenario import data_folder, scenario_names
 from consistency.bench.sweeps.sweep_file import load_sweep, sweep_names
+from consistency.bench.types import GUARDS
 
 PYTHON = ("python", "python notebook")
 SITE = re.compile(r"\{[\w-]+\}.*")  # directives of the site

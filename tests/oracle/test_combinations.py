@@ -96,7 +96,7 @@ class Bench:
     def stand(self, before, after):
         """A point that is not the estimate is put there, so that finite differences are the Jacobians at it."""
         if stands_apart(self.slam.point):
-            path = self.slam.point.path if isinstance(self.slam.point, AtTruth) else self.work.notes.path
+            path = self.slam.point.path if isinstance(self.slam.point, AtTruth) else self.work.of_point.path
             path[0], path[1] = before[: path.shape[1]], after[: path.shape[1]]
 
     def moved(self, x, n, error):

@@ -39,8 +39,12 @@ def test_joint_marginals_of_keyframes_agree_with_independent_motions(tmp_path, r
     t = np.array(lines)[:, :1]
     np.savetxt(tmp_path / "est.tum", np.column_stack([t, estimates]), fmt="%.17g")
     np.savetxt(tmp_path / "P.txt", lines, fmt="%.17g")
-    np.savetxt(tmp_path / "truth.tum", np.column_stack([s.t, s.truth]), fmt="%.17g")
-    np.savetxt(tmp_path / "motions.tum", np.column_stack([s.t, s.estimate, s.covariance.reshape(-1, 36)]), fmt="%.17g")
+    np.savetxt(tmp_path / "truth.tum", np.column_stack([s.own.t, s.true.values]), fmt="%.17g")
+    np.savetxt(
+        tmp_path / "motions.tum",
+        np.column_stack([s.own.t, s.own.estimate, s.own.covariance.reshape(-1, 36)]),
+        fmt="%.17g",
+    )
     poses = cs.read(
         tmp_path / "est.tum", tmp_path / "truth.tum", tmp_path / "P.txt", "left", relative=1,
         covariance_order="rotation-translation",

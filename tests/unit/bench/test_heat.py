@@ -137,8 +137,8 @@ def test_colours_say_which_way():
     assert colour_of(1.0 / heat.FULL) == colour_of(1e-9) == colour_of(0.0) == heat.SMALL.lower()
     red, _, blue = (int(colour_of(1.5)[i : i + 2], 16) for i in (1, 3, 5))
     assert red > blue, "towards vermilion"
-    assert ink_on(heat.PAPER) == "#000000"
-    assert ink_on(heat.SMALL) == "#ffffff"
+    assert ink_on(heat.PAPER) == ink_on(heat.SMALL) == "#000000"
+    assert ink_on("#0072b2") == "#ffffff"
 
 
 def test_page_and_paper_show_it(tmp_path):

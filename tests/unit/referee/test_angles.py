@@ -58,8 +58,17 @@ def test_what_is_no_angle_and_what_may_be_an_error_stays(name, wrapped, offset, 
         assert (np.abs(found) > np.pi).any()
 
 
+def test_an_error_of_half_a_turn_stays(tmp_path):
+    for file, yaw in (("est.csv", 1.0 - 0.6 * 2.0 * np.pi), ("true.csv", 1.0)):
+        lines = ["t,px,yaw,var_px,var_yaw", *(f"{k},{k},{yaw:.9f},1,1" for k in range(4))]
+        (tmp_path / file).write_text("\n".join(lines), encoding="utf-8")
+    found, notes = errors_of(tmp_path, "yaw")
+    assert_allclose(found, 0.6 * 2.0 * np.pi, atol=1e-6)
+    assert "turned back" not in notes
+
+
 def test_an_angle_that_counts_turns_stays(rng, tmp_path):
-    error = written(tmp_path, rng, turn=3600.0, wrapped=False)
+    error = written(tmp_path, rng, turn=3600.0, wrapped=False, offset=0.09 * 2.0 * np.pi)  # 0.9 of 360
     found, notes = errors_of(tmp_path, "yaw")
     assert_allclose(found, error, atol=1e-5)
     assert "turned back" not in notes

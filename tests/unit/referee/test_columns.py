@@ -20,6 +20,7 @@ from consistency.referee.readers.formats.columns import (
     covariance_columns,
     pose_columns,
     rates_in,
+    run_column,
     state_columns,
     true_pose_columns,
 )
@@ -290,3 +291,11 @@ def test_where_the_covariances_of_a_file_stand(inside):
     assert restated(deviations, turned) == (
         {f"sd_{word}": (axis, axis) for word, axis in zip(words, [*words[3:], *words[:3]], strict=True)}, False
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "names, run",
+    [(["t", "Drive"], "Drive"), (["trial", "run_id"], "run_id"), (["run", "drive"], None), (["t", "driven"], None)],
+)
+def test_the_column_that_numbers_runs(names, run):
+    assert run_column(names) == run

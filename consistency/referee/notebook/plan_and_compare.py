@@ -126,7 +126,7 @@ def verdict_table(verdicts: Mapping[str, Verdict] | Iterable[Verdict]) -> pd.Dat
     Raises
     ------
     MissingPackageError
-        There is no pandas.
+        pandas is not installed.
     """
     with explained_import("verdict_table"):
         import pandas as pd

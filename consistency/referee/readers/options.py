@@ -217,7 +217,7 @@ class Reading:
         Raises
         ------
         TypeError
-            There is no such option.
+            An option is unknown.
         """
         changed: dict[str, dict[str, Any]] = {}
         for name, value in options.items():
@@ -236,7 +236,7 @@ class Reading:
 
 
 def make_reading(**options: Any) -> Reading:
-    """Options of files by name; raises TypeError where there is no such option."""
+    """Options of files by name; raises TypeError if one is unknown."""
     return Reading().with_options(**options)
 
 

@@ -241,7 +241,7 @@ class Poses:
         Raises
         ------
         KeyError
-            There is no such value.
+            A name is unknown.
         """
         changed: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
@@ -387,7 +387,7 @@ def make_poses(
     Raises
     ------
     KeyError
-        There is no such value.
+        A name is unknown.
     """
     own = Estimates(place, t, estimate, covariance, stated)
     return Poses(own, TrueStates(true_t, truth), manifold, convention, max_dt).with_values(**others)

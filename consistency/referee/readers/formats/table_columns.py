@@ -277,8 +277,6 @@ def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Pose
     """
     angles = [i for i, axis in enumerate(axes) if ANGLES & set(axis.lower().split("_"))]
     found = list(runs)
-    if angles:
-        found = [p.with_values(estimate=p.own.estimate.copy(), truth=p.true.values.copy()) for p in runs]
     changed = []
     for i in angles:
         size = max(
@@ -286,11 +284,9 @@ def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Pose
         )
         turn = 2.0 * np.pi if size <= 2.0 * np.pi + 1e-6 else 360.0
         rows = 0
-        for p in found if size <= 360.0 else ():
-            rows += int((np.abs(_apart(p, i)) > LEAST_APART * turn).sum())
-            p.true.values[:, i] = np.unwrap(p.true.values[:, i], period=turn)
-            apart = _apart(p, i)
-            p.own.estimate[:, i] += turn * np.where(np.abs(apart) > LEAST_APART * turn, np.round(apart / turn), 0.0)
+        for k, p in enumerate(found if size <= 360.0 else ()):
+            rows += int((np.abs(_apart(p, p.true.values[:, i], i)) > LEAST_APART * turn).sum())
+            found[k] = _on_one_turn(p, i, turn)
         if rows:
             changed.append(f"{axes[i]} ({plural(rows, 'row')})")
     if not changed:
@@ -299,9 +295,25 @@ def without_turns(runs: Sequence[Poses], axes: Sequence[str]) -> tuple[list[Pose
     return found, f"{what}; --error vector leaves them"
 
 
-def _apart(p: Poses, i: int) -> Array:
-    """Truth less estimate of one component, (N,), the truth interpolated."""
-    return np.asarray(np.interp(p.own.t, p.true.t, p.true.values[:, i]) - p.own.estimate[:, i])
+def _on_one_turn(p: Poses, i: int, turn: float) -> Poses:
+    """The run with one angle on the turn of its truth; the same arrays where nothing changes."""
+    column = np.unwrap(p.true.values[:, i], period=turn)
+    if (column != p.true.values[:, i]).any():
+        truth = p.true.values.copy()
+        truth[:, i] = column
+        p = p.with_values(truth=truth)
+    apart = _apart(p, column, i)
+    turns = np.where(np.abs(apart) > LEAST_APART * turn, np.round(apart / turn), 0.0)
+    if turns.any():
+        estimate = p.own.estimate.copy()
+        estimate[:, i] += turn * turns
+        p = p.with_values(estimate=estimate)
+    return p
+
+
+def _apart(p: Poses, column: Array, i: int) -> Array:
+    """One component of the truth, interpolated, less that of the estimate, (N,)."""
+    return np.asarray(np.interp(p.own.t, p.true.t, column) - p.own.estimate[:, i])
 
 
 # --- covariances and innovations ------------------------------------------------------------------------

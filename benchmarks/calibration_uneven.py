@@ -185,15 +185,21 @@ def _decided(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
         return
     for k, ((world, n), stated) in enumerate(DECIDED_CLEARED.items()):
         rng = np.random.default_rng((seed, 116, k))
-        found = sum(_is_decided_consistent(rng, UNEVEN[world][0](rng, MOST), n) for _ in range(GATES))
-        yield row(f"{world}, n = {n}", DECIDED, DETECT, MOST, stated, "<=", GATES, found) | {"looks": 0}
+        gates = [_decision(rng, UNEVEN[world][0](rng, MOST), n) for _ in range(GATES)]
+        found, took = sum(consistent for consistent, _ in gates), [runs for _, runs in gates]
+        yield row(f"{world}, n = {n}", DECIDED, DETECT, MOST, stated, "<=", GATES, found) | {
+            "looks": 0,
+            "mean_runs": round(float(np.mean(took)), 1),
+            "late_runs": float(np.quantile(took, 0.95, method="higher")),
+        }
 
 
-def _is_decided_consistent(rng: np.random.Generator, squares: Array, n: int) -> bool:
+def _decision(rng: np.random.Generator, squares: Array, n: int) -> tuple[bool, int]:
+    """Is it consistent once it is decided, and after how many runs is it?"""
     error = np.repeat(np.sqrt(squares)[:, None, None] * rng.standard_normal((MOST, 1, n)), ALIKE, axis=1)
     record = make_record("uneven", error, shared(np.eye(n), error))
-    verdict, _ = follow(sequential_design(n, DETECT, FALSE_ALARM, POWER, MOST), record.first_runs)
-    return verdict.consistent
+    verdict, runs = follow(sequential_design(n, DETECT, FALSE_ALARM, POWER, MOST), record.first_runs)
+    return verdict.consistent, runs
 
 
 def _named(quick: bool, seed: int) -> Iterator[dict[str, Any]]:

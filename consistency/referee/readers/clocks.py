@@ -79,8 +79,10 @@ def sample_of(poses: Poses, axes: Sequence[int]) -> Sample:
     """The finite estimates of a run, with the factors of their covariances."""
     poses = poses.sound()
     P = submatrices(poses.own.covariance, axes)
-    columns = [whiten(np.broadcast_to(unit, P.shape[:2]), P) for unit in np.eye(len(axes))]
-    return Sample(poses, axes, np.stack(columns, axis=-1))
+    factors = np.empty(P.shape)  # filled column by column: a second copy of a million of them is 300 MB
+    for j, unit in enumerate(np.eye(len(axes))):
+        factors[..., j] = whiten(np.broadcast_to(unit, P.shape[:2]), P)
+    return Sample(poses, axes, factors)
 
 
 def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> list[Sample]:

@@ -429,8 +429,8 @@ def finite_rows(values: Array) -> Array:
 
 def submatrices(P: Array, index: Sequence[int]) -> Array:
     """Rows and columns ``index`` of matrices (N, n, n)."""
-    part = list(index)
-    return np.asarray(P[:, part][:, :, part])
+    part = np.array(index)
+    return P if np.array_equal(part, range(P.shape[-1])) else np.asarray(P[:, part[:, None], part])
 
 
 def unstated(rows: int, n: int) -> tuple[Array, Array]:

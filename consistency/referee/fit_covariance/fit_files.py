@@ -33,8 +33,8 @@ from consistency.referee.fit_covariance.correct_bounds import (
     data_of_bounds,
 )
 from consistency.referee.fit_covariance.covariance_ratios import write_motions
+from consistency.referee.fit_covariance.drives import PIECES, ways
 from consistency.referee.fit_covariance.factors import stated_errors
-from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.noise_model import NoiseModel, correction, data_of_model, noise_document
 from consistency.referee.fit_covariance.pictures import draw_correction, draw_noise
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT

@@ -117,9 +117,9 @@ def run_command(
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.recorded_log import read_log
     from consistency.bench.store.results import Results, StoredResults
-    from consistency.referee.document.tables import document
     from consistency.referee.show import terminal
     from consistency.referee.system.progress import say
+    from consistency.referee.verdicts.tables import document
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -301,10 +301,10 @@ def tune_command(
     from consistency.bench.store.recorded_log import read_log
     from consistency.bench.tuning.tune import KIND, tuning_data, tuning_lines, tuning_verdicts, write
     from consistency.bench.tuning.tune import tune as tune_filter
-    from consistency.referee.document.tables import document
     from consistency.referee.show import terminal
     from consistency.referee.system.folders import require_free
     from consistency.referee.verdicts.judge_sources import settings_of
+    from consistency.referee.verdicts.tables import document
 
     require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):

@@ -16,7 +16,6 @@ import numpy as np
 
 from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.document.blocks import Chapter, Document, Figure, Status, Text
 from consistency.referee.fit_covariance.correct import (
     ByGroup,
     Correction,
@@ -41,6 +40,7 @@ from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
 from consistency.referee.show import as_html, as_json
+from consistency.referee.show.blocks import Chapter, Document, Figure, Status, Text
 from consistency.referee.system.folders import manifest_of, write_folder
 from consistency.referee.types import Array
 

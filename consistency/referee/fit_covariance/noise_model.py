@@ -17,7 +17,6 @@ from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.number_words import plural, short
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (
     DECIDE,
@@ -69,6 +68,7 @@ from consistency.referee.fit_covariance.refusals import (
 )
 from consistency.referee.geometry import log, matrices
 from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.show.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.types import Array
 
 SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at

@@ -16,7 +16,6 @@ import numpy as np
 from consistency.referee.diagnostics.number_words import plural, with_subject
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
@@ -25,6 +24,7 @@ from consistency.referee.pages.ratio_figures import bound_figures, by_axis, rati
 from consistency.referee.pages.record_figures import OVER_SIGMA, record_figures
 from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
 from consistency.referee.show import FORMATS, rendered
+from consistency.referee.show.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.system.stopping import write_whole
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from typing import Any
 import matplotlib as mpl
 import typst
 
-from consistency.referee.document import blocks
-from consistency.referee.document.blocks import unbroken, written
+from consistency.referee.show import blocks
+from consistency.referee.show.blocks import unbroken, written
 from consistency.referee.show.figures import Pictures, paint
 from consistency.referee.system.stopping import AT_STOP, remove_at_stop
 

@@ -16,7 +16,7 @@ from consistency.bench.runs import reproduce_findings
 from consistency.bench.runs import reproduce_findings as module
 from consistency.bench.runs.reproduce_findings import Study, reproduce
 from consistency.commands.studies import reproduce_command
-from consistency.referee.document.blocks import Heading
+from consistency.referee.show.blocks import Heading
 from consistency.referee.system.folders import read_manifest
 
 SCRIPT = '''"""A question."""

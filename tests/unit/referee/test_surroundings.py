@@ -15,7 +15,6 @@ import pytest
 
 import consistency as cs
 from consistency.commands import main
-from consistency.referee.document.blocks import Document
 from consistency.referee.parsing import require_name
 from consistency.referee.programs import process
 from consistency.referee.programs.process import program_of
@@ -25,6 +24,7 @@ from consistency.referee.readers.formats.text_blocks import Block, floats, read_
 from consistency.referee.readers.mix_ups.reading_fit import fit_of
 from consistency.referee.readers.truth_matching import make_poses
 from consistency.referee.show import as_md, figures
+from consistency.referee.show.blocks import Document
 from consistency.referee.show.figures import canvas
 from consistency.referee.system import stopping
 from consistency.referee.system.folders import NewFolder, require_free

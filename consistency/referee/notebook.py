@@ -1,23 +1,27 @@
-"""Files of another estimator to a record, and the verdict on it; how both show themselves in a notebook."""
+"""Files of another estimator in three lines of Python: read, judge, look; also inspect, plan, compare and list.
+
+Their errors name arguments, where those of commands name flags. A record and a verdict show themselves in a notebook by
+the functions at the end. What each does stands in ``readers`` and ``verdicts``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
+from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.judge_record import judge as judge_record
 from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.record import Record, numbered_axes
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Bullets, Facts, Figure, fragment
-from consistency.referee.document.tables import document, summary_blocks
 from consistency.referee.errors import InputError, naming_arguments
+from consistency.referee.extras import explained_import
 from consistency.referee.readers.formats.members import UNWEIGHTED
 from consistency.referee.readers.options import (
     OPTIONS,
@@ -37,11 +41,17 @@ from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
 from consistency.referee.readers.truth_covariance import declared, require_truth_options
 from consistency.referee.show import as_html
-from consistency.referee.verdicts.inspect_sources import Inspection
-from consistency.referee.verdicts.inspect_sources import inspect_files as inspect_file
-from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
+from consistency.referee.show.blocks import Bullets, Facts, Figure, fragment
+from consistency.referee.verdicts.compare_sources import Compared, baseline, compare_with, is_baseline, read_baseline
+from consistency.referee.verdicts.inspect_sources import Inspection, inspect_files
+from consistency.referee.verdicts.judge_sources import pilots_of_records, plan_runs, settings_of, skip_asked
+from consistency.referee.verdicts.tables import document, summary_blocks
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 OF_PATHS = ("truth", "covariance", "by_file")  # options that are paths
+GIVEN = ("same trials", None)  # origin of records whose trials are declared to be the same
 
 
 @naming_arguments
@@ -197,7 +207,7 @@ def inspect(path: str | Path, **options: Any) -> Inspection:
     given: dict[str, Any] = {
         name: Path(value) if name in OF_PATHS and value is not None else value for name, value in options.items()
     }
-    return inspect_file(Path(path), make_reading(**given))
+    return inspect_files(Path(path), make_reading(**given))
 
 
 @naming_arguments
@@ -303,6 +313,134 @@ def judge(
     if optimal_gain:
         record = record.with_optimal_gain()
     return judge_record(record, settings_of(**settings), keep_record=True)
+
+
+@naming_arguments
+def plan(
+    dof: int = 3,
+    *,
+    detect: float = DETECT,
+    false_alarm: float = FALSE_ALARM,
+    power: float = POWER,
+    allow: str | None = None,
+    lost: float | None = None,
+    groups: int | None = None,
+    like: Record | str | Path | None = None,
+) -> dict[str, Any]:
+    """Compute how many runs a verdict needs, whatever the dependence of steps.
+
+    Parameters
+    ----------
+    dof : dimension of the error; that of ``like`` where that is given
+    detect : ratio of true to stated covariance that must be found
+    false_alarm : probability of rejecting a correct filter
+    power : probability of finding that ratio
+    allow : "conservative" accepts a covariance that is too large
+    lost : share of lost runs that must be excluded
+    groups : number of groups, in one of which that ratio must be found
+    like : a record or file of similar runs, which shows how steps depend on each other
+
+    Returns
+    -------
+    dict
+        ``runs``, ``one_step``, ``looks``, and with ``like`` the runs that such a filter takes, as ``plan --json``.
+
+    Raises
+    ------
+    InputError
+        A number out of its range, or ``like`` has no truth or too few runs.
+    """
+    pilots, pilot_dof = None, dof
+    if like is not None:
+        pilots, pilot_dof = pilots_of_records([like if isinstance(like, Record) else read(like)])
+        dof = pilot_dof
+    return plan_runs(dof, detect, false_alarm, power, allow, pilots, lost, pilot_dof, groups)
+
+
+@naming_arguments
+def compare(
+    new: Record | str | Path,
+    old: Record | str | Path,
+    *,
+    same_trials: bool = False,
+    false_alarm: float = FALSE_ALARM,
+    skip: str | float | None = None,
+    **options: Any,
+) -> Compared:
+    """Compare an estimator with another, or with an earlier version, run by run where the trials are the same.
+
+    Parameters
+    ----------
+    new, old : records, or files, which are read with ``options``; ``old`` may be a file of ``consistency baseline``
+    same_trials : records with runs of the same numbers are of the same trials; of files the truth tells
+    false_alarm : probability of calling ``new`` worse where it is not
+    skip : first steps (20) or seconds ("2s") of each run to leave out
+    options : of :func:`consistency.read`
+
+    Returns
+    -------
+    Compared
+        ``print`` shows the sentence; ``worse``, and ``comparison`` with all numbers.
+
+    Raises
+    ------
+    InputError
+        There is no NEES, or the errors have different components.
+    """
+    if not 0.0 < false_alarm < 1.0:
+        raise InputError(f"--false-alarm must lie between 0 and 1, got {false_alarm}")
+    truth = None if options.get("truth") is None else Path(options["truth"])
+    sides = []
+    for side, name in ((new, "new"), (old, "old")):
+        if not isinstance(side, Record) and is_baseline(Path(side)):
+            sides.append(read_baseline(Path(side), skip))
+            continue
+        record = side if isinstance(side, Record) else read(side, **options)
+        origin = None if isinstance(side, Record) else truth
+        summary = baseline([record], name if isinstance(side, Record) else str(side), skip, origin)
+        sides.append(replace(summary, origin=GIVEN) if same_trials else summary)
+    (found,) = compare_with(sides[0], sides[1], (), false_alarm)
+    return found
+
+
+@naming_arguments
+def verdict_table(verdicts: Mapping[str, Verdict] | Iterable[Verdict]) -> pd.DataFrame:
+    """List verdicts in a DataFrame, a row each, from which pandas writes LaTeX; needs pandas.
+
+    Parameters
+    ----------
+    verdicts : by the name of a row; without names those of the estimators
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``verdict``, ``runs``, ``steps``, ``anees`` and its expected value, ``ratio`` of true to stated covariance with
+        the ends of its interval, ``worst_axis``, ``failed`` runs and ``faults``; NaN without a truth
+
+    Raises
+    ------
+    MissingPackageError
+        pandas is not installed.
+    """
+    with explained_import("verdict_table"):
+        import pandas as pd
+
+    named = verdicts if isinstance(verdicts, Mapping) else [(verdict.filter, verdict) for verdict in verdicts]
+    rows = {}
+    for name, v in dict(named).items():
+        ratio = (float("nan"),) * 3 if v.scale is None else tuple(v.scale.inflation)
+        rows[name] = {
+            "verdict": v.status, "runs": v.runs, "steps": v.steps,
+            "anees": float("nan") if v.scale is None else v.scale.mean_anees, "expected": v.scale.dof if v.scale else 0,
+            "ratio": ratio[0], "ratio_low": ratio[1], "ratio_high": ratio[2],
+            "worst_axis": v.worst_axis[0] if v.worst_axis else "", "failed": len({f.run for f in v.failures}),
+            "faults": ", ".join(v.faults),
+        }  # fmt: skip
+    table: pd.DataFrame = pd.DataFrame.from_dict(rows, orient="index")
+    return table
+
+
+# --- how they show themselves -----------------------------------------------------------------------------------------
 
 
 def record_text(record: Record) -> str:

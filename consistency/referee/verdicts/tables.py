@@ -27,7 +27,8 @@ from consistency.referee.diagnostics.sentences import question_text
 from consistency.referee.diagnostics.status import axis_at_fault
 from consistency.referee.diagnostics.verdict import MapScore, Verdict
 from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
-from consistency.referee.document.blocks import (
+from consistency.referee.geometry import ADDITIVE, PLANAR
+from consistency.referee.show.blocks import (
     NONE,
     PLAIN,
     Block,
@@ -46,11 +47,10 @@ from consistency.referee.document.blocks import (
     table,
     written,
 )
-from consistency.referee.geometry import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.comparison import Comparison, Difference
-    from consistency.referee.document.blocks import Look
+    from consistency.referee.show.blocks import Look
 
 FILTER = Column("Filter")
 IN_WORLD = 3  # of these are shown of the additive error, too

@@ -1,1 +1,0 @@
-"""Files of another estimator in three lines of Python: read, judge, look."""

@@ -24,7 +24,7 @@ from consistency.referee.show.blocks import (
     style,
 )
 from consistency.referee.show.figures import add_legend, band, canvas, dots, log_axis, stroke
-from consistency.referee.system.folders import manifest_of, write_folder
+from consistency.referee.system import manifest_of, write_folder
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences

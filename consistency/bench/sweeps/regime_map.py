@@ -31,7 +31,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.pages.write_pages import write_file
 from consistency.referee.parsing import read_json, reading
 from consistency.referee.show.blocks import NONE, Block, Cell, Column, Status, Table, Text, table
-from consistency.referee.system.folders import SCHEMA_VERSION, manifest_of
+from consistency.referee.system import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
 SHIPPED = "regime.json"

@@ -43,7 +43,7 @@ from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arra
 from consistency.referee.readers.pipeline.read_files import checked_options
 from consistency.referee.readers.pipeline.relative_motions import rows_as_declared
 from consistency.referee.show.blocks import Block, Column, Document, Table, Text, table
-from consistency.referee.system.progress import progress
+from consistency.referee.system import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
 

@@ -26,7 +26,7 @@ from consistency.referee.readers.pipeline.relative_motions import relative_recor
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.runs_to_record import Relative
 from consistency.referee.readers.truth_matching import Poses, make_poses
-from consistency.referee.system.progress import with_progress
+from consistency.referee.system import with_progress
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH

@@ -41,7 +41,7 @@ from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
 from consistency.referee.show import as_html, as_json
 from consistency.referee.show.blocks import Chapter, Document, Figure, Status, Text
-from consistency.referee.system.folders import manifest_of, write_folder
+from consistency.referee.system import manifest_of, write_folder
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

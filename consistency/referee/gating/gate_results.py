@@ -27,7 +27,7 @@ from consistency.referee.show.blocks import (
     fragment,
     table,
 )
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import write_whole
 
 NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 HEADS = (

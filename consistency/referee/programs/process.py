@@ -23,8 +23,7 @@ from pathlib import Path
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, require_name
 from consistency.referee.readers.pipeline.program_runs import LOG, RUN_FILE, RUN_KIND, ProgramRun, filled
-from consistency.referee.system.progress import say
-from consistency.referee.system.stopping import AT_STOP, FULL
+from consistency.referee.system import AT_STOP, FULL, say
 
 LARGEST_SEED = 2**31 - 1  # fits an int and std::stoi
 HALF = 2**16

@@ -59,9 +59,7 @@ from consistency.referee.readers.pipeline.read_files import (
     records_of_found,
 )
 from consistency.referee.readers.truth_matching import Estimator
-from consistency.referee.system.folders import IN_PYTHON, manifest_of, writing
-from consistency.referee.system.progress import Advance, progress, say
-from consistency.referee.system.stopping import PARTIAL, write_whole
+from consistency.referee.system import IN_PYTHON, PARTIAL, Advance, manifest_of, progress, say, write_whole, writing
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
 FOR_PLAN = ("until_decided", "max_runs", "seed", "jobs", "timeout", "check_seed", "keep", "optimal_gain")

@@ -22,8 +22,7 @@ from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
 from consistency.referee.show.blocks import Block, Document, Text
-from consistency.referee.system.folders import SCHEMA_VERSION, manifest_of, writing
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import SCHEMA_VERSION, manifest_of, write_whole, writing
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
 from consistency.referee.verdicts.tables import comparison_table

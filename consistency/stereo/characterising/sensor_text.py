@@ -19,8 +19,7 @@ from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
 from consistency.referee.show.blocks import Block, Cell, Column, Quantity, Table, Text, table
-from consistency.referee.system.folders import writing
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import write_whole, writing
 from consistency.stereo.characterising.characterise import NAMES, BiasEstimate, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian

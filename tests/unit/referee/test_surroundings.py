@@ -15,6 +15,7 @@ import pytest
 
 import consistency as cs
 from consistency.commands import main
+from consistency.referee import system
 from consistency.referee.parsing import require_name
 from consistency.referee.programs import process
 from consistency.referee.programs.process import program_of
@@ -26,8 +27,7 @@ from consistency.referee.readers.truth_matching import make_poses
 from consistency.referee.show import as_md, figures
 from consistency.referee.show.blocks import Document
 from consistency.referee.show.figures import canvas
-from consistency.referee.system import stopping
-from consistency.referee.system.folders import NewFolder, require_free
+from consistency.referee.system import NewFolder, require_free
 
 HEAD = "t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n"
 
@@ -134,20 +134,20 @@ def test_the_umask_holds(files, mask, folder, file):
 
 
 def test_a_signal_removes_what_is_half_written(tmp_path):
-    before = list(stopping.AT_STOP)
+    before = list(system.AT_STOP)
     with NewFolder(tmp_path / "out", "verdict") as new:
         (new.path / "half").write_text("half")
-        (removal,) = [each for each in stopping.AT_STOP if each not in before]
+        (removal,) = [each for each in system.AT_STOP if each not in before]
         removal()
         assert not new.path.exists()
-    assert before == stopping.AT_STOP
+    assert before == system.AT_STOP
 
 
 REPORTING = """
 import sys, time
 import consistency.commands as cli
 from consistency.__main__ import main
-from consistency.referee.system.folders import NewFolder
+from consistency.referee.system import NewFolder
 from pathlib import Path
 sys.argv = ["consistency", "analyse"]
 def work():

@@ -39,7 +39,7 @@ from consistency.referee.readers.truth_matching import (
     StatedError,
     make_poses,
 )
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.system import read_manifest
 
 RUN_KIND = "run of a program"  # of run.json: a program may write a file of that name itself
 LOG = "program.log"  # standard output and error of a run

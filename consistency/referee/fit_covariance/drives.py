@@ -376,10 +376,12 @@ def cut_windows(
     refused: list[InputError] = []
     for number, drive in enumerate(drives):
         try:
-            first, last, left_out = _rows_of_windows(drive, span)
+            rows = drive.row if span.unit == "step" else np.arange(len(drive.t))
+            first, last, left_out = windows(drive.t, drive.truth[:, :-1, -1], rows, span, drive.name)
         except InputError as error:
             refused.append(error)
             continue
+        first, last = np.searchsorted(rows, first), np.searchsorted(rows, last)
         ends = _ends(first, last, pieces)
         estimated = motions_between(drive.estimate, ends[:, :-1], ends[:, 1:], planar)
         true_pieces = motions_between(drive.truth, ends[:, :-1], ends[:, 1:], planar)
@@ -388,8 +390,8 @@ def cut_windows(
         long += left_out
     if not parts:
         raise refused[-1]
-    rows: dict[str, Any] = dict(zip(ROWS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
-    found = DriveWindows(tuple(drives), span, planar, **rows, long=long)
+    by_name: dict[str, Any] = dict(zip(ROWS, map(np.concatenate, zip(*parts, strict=True)), strict=True))
+    found = DriveWindows(tuple(drives), span, planar, **by_name, long=long)
     moves = _moves(found)
     jumps = _jumps(found)
     sound = moves & ~jumps
@@ -397,13 +399,6 @@ def cut_windows(
         raise InputError(f"--span {span.option}: no window of {drives[0].name} has motion without a jump; take another")
     counted = replace(found, still=int((~moves).sum()), jumps=int((moves & jumps).sum()))
     return counted.of(sound)
-
-
-def _rows_of_windows(drive: Drive, span: Relative) -> tuple[Indices, Indices, int]:
-    """First and last row of each window of a drive, and how many are left out."""
-    rows = drive.row if span.unit == "step" else np.arange(len(drive.t))
-    first, last, left_out = windows(drive.t, drive.truth[:, :-1, -1], rows, span, drive.name)
-    return np.searchsorted(rows, first), np.searchsorted(rows, last), left_out
 
 
 def _ends(first: Indices, last: Indices, pieces: int) -> Indices:

@@ -393,7 +393,7 @@ class _Loop:
                 self._check_seed(stack)
             run = next(missing)
             while not self._is_decided:
-                while len(pending) < self._at_once(workers) and not self._is_enough(run):
+                while len(pending) < self._at_once(workers) and (self.total is None or run < self.total):
                     pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
                     run = next(missing)
                 if not pending:
@@ -408,9 +408,6 @@ class _Loop:
     def _at_once(self, workers: int) -> int:
         """Runs at a time: few until the first ones have shown that the program works."""
         return workers if len(self.runs.found) >= PROOF else min(workers, PROOF)
-
-    def _is_enough(self, run: int) -> bool:
-        return self.total is not None and run >= self.total
 
     @property
     def _is_decided(self) -> bool:

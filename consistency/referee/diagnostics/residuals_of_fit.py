@@ -61,8 +61,8 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     every = kernels
     if not shared:
         every = np.concatenate([kernels, _slower(longest)])
-    lagged = [_lags(np.square(np.abs(_spectrum(r))), len(r)) for r in residuals]  # sums of r_k r_k+l, (n, T) each
-    seen = np.array([_binned(products, edges) for products in lagged])  # (N, n, bins)
+    # sums of r_k r_k+l, (N, n, bins)
+    seen = np.array([_binned(_lags(np.square(np.abs(_spectrum(r))), len(r)), edges) for r in residuals])
     pairs = np.array([_binned(np.maximum(len(r) - np.arange(longest), 0.0), edges) for r in residuals])  # (N, bins)
     whole = _expected(bases, every, edges, shared)  # (N, n, bins, n, J)
     if not shared and _oscillate(seen, whole, pairs):

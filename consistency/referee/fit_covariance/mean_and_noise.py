@@ -161,9 +161,10 @@ def choose_mean(
     with np.errstate(divide="ignore", invalid="ignore"):  # of motions without an error
         gain = np.log(range_of_both / (neighbours.high - neighbours.low))[:SCALES].sum()
     are_instruments = strength >= STRONG and not lasts and gain > 0
-    used = [NEIGHBOURS] if are_instruments else [FORWARD, BACKWARD]
+    used, whole = [FORWARD, BACKWARD], forward.mean
+    if are_instruments:
+        used, whole = [NEIGHBOURS], neighbours.mean
     mean, low, high, free = _select(windows, near, [equations[each] for each in used])
-    whole = neighbours.mean if are_instruments else forward.mean
     turns = forward.mean.turn, backward.mean.turn
     return MeanFit(mean, whole, low, high, free, used[0], turns, strength, lasts)
 
@@ -457,7 +458,7 @@ def least_of(error: Array) -> Array:
         All errors of one kind are nothing but rounding.
     """
     square = mean_square(error)
-    d = 2 if len(square) == 3 else 3
+    d = d_of(square)
     least = np.empty(len(square))
     for what, part in (("positions", slice(d)), ("rotations", slice(d, None))):
         largest = square[part].max()

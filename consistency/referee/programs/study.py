@@ -180,16 +180,20 @@ def _run(
 ) -> tuple[list[Record], dict[str, Verdict]]:
     here = Path.cwd()
     of_plan = {name: value for name, value in options.items() if name in FOR_PLAN}
-    of_files = {name: value for name, value in options.items() if name not in (*FOR_PLAN, *FOR_STUDY)}
-    for name in of_files:
-        if name not in VALUES:
+    of_files: dict[str, Any] = {}
+    for name, value in options.items():
+        if name in VALUES:
+            of_files[name] = value
+        elif name not in (*FOR_PLAN, *FOR_STUDY):
             raise TypeError(f"monte_carlo: unknown option '{name}'")
     of_files["truth"] = truth
     for name in PATHS:
         if of_files.get(name) is not None:
             of_files[name] = Path(of_files[name])
     each, cwd, skip, resume, overwrite = map(options.get, FOR_STUDY)
-    program = program_of(argv, here, None if cwd is None else Path(cwd))
+    if cwd is not None:
+        cwd = Path(cwd)
+    program = program_of(argv, here, cwd)
     inputs = () if each is None else inputs_of(each, here)
     plan = ProgramPlan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
     reading = make_reading(**of_files)

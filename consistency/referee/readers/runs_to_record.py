@@ -339,7 +339,9 @@ def _reason(error_ok: bool, kind: int, what: str = "estimate") -> str:
 def _cut(track: Track, counted: Array) -> dict[str, Any]:
     """Arrays by name of as many rows as ``counted`` (k,) has, with the NEES of those that count."""
     end = len(counted)
-    arrays: dict[str, Any] = {key: at(getattr(track, key), slice(end)) for key in ("column", "t", *ARRAYS)}
+    arrays: dict[str, Any] = {}
+    for key in ("column", "t", *ARRAYS):
+        arrays[key] = at(getattr(track, key), slice(end))
     error, P = arrays["error"], arrays["covariance"]
     if error is None or P is None:
         return arrays

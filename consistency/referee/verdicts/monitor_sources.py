@@ -96,8 +96,12 @@ def make_monitor(
             "model. Of any other filter the innovations are not white, and no false-alarm rate holds"
         )
     try:
-        text = str(gate)
-        share = None if gate is None else float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        share = None
+        if gate is not None:
+            text = str(gate)
+            share = float(text.removesuffix("%"))
+            if text.endswith("%"):
+                share /= 100.0
     except ValueError:
         raise InputError(f"--gate {gate}: must be a probability, such as 99% or 0.99") from None
     try:

@@ -474,8 +474,9 @@ def plan_lines(planned: dict[str, Any]) -> list[str]:
     A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs alike.
     """
     p = planned
-    side = "small" if p["detect"] > 1.0 else "large"
-    factor = p["detect"] if p["detect"] > 1.0 else 1.0 / p["detect"]
+    side, factor = "small", p["detect"]
+    if factor <= 1.0:
+        side, factor = "large", 1.0 / factor
     lines = [
         f"{p['runs']} runs: a verdict at false alarm {p['false_alarm']:g} then finds a covariance too {side} by "
         f"x{factor:.3g} with power {p['power']:g}"

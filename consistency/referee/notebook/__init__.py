@@ -392,12 +392,13 @@ def compare(
     truth = None if options.get("truth") is None else Path(options["truth"])
     sides = []
     for side, name in ((new, "new"), (old, "old")):
-        if not isinstance(side, Record) and is_baseline(Path(side)):
+        if isinstance(side, Record):
+            summary = baseline([side], name, skip, None)
+        elif is_baseline(Path(side)):
             sides.append(read_baseline(Path(side), skip))
             continue
-        record = side if isinstance(side, Record) else read(side, **options)
-        origin = None if isinstance(side, Record) else truth
-        summary = baseline([record], name if isinstance(side, Record) else str(side), skip, origin)
+        else:
+            summary = baseline([read(side, **options)], str(side), skip, truth)
         sides.append(replace(summary, origin=GIVEN) if same_trials else summary)
     (found,) = compare_with(sides[0], sides[1], (), false_alarm)
     return found

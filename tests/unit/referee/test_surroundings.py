@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -340,3 +341,17 @@ def test_sound_poses_have_no_variance_that_counts_as_none():
     assert poses.sound().variances.tolist() == [[0.0, 1e-23, 4.0]] * 2
     assert poses.sound().own.covariance[0, 0, 2] == 1e-14
     assert poses.own.covariance[0, 0, 0] == 1e-25
+
+
+def test_the_commit_is_that_of_the_checkout_around_the_package(monkeypatch):
+    asked = []
+
+    def run(command, **_):
+        asked.append(command)
+        return SimpleNamespace(stdout="# branch.oid abc\n1 .M N... consistency/types.py\n")
+
+    monkeypatch.setattr(system.Path, "exists", lambda _: True)
+    monkeypatch.setattr(system.subprocess, "run", run)
+    assert system._git_commit.__wrapped__() == "abc-dirty"
+    assert asked[0][:3] == ["git", "-C", str(Path(system.__file__).parents[2])]
+    assert (Path(asked[0][2]) / "consistency/__init__.py").is_file()

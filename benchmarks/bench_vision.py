@@ -13,7 +13,7 @@ from bench_trials import SEED, Work, interleaved
 
 from consistency.bench.runs.reproduce_findings import sibling
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import data_folder
+from consistency.referee.system import data_folder
 from consistency.stereo.visual_odometry.odometry import visual_odometry
 from consistency.stereo.visual_odometry.relative_pose import rigid_motions
 from consistency.stereo.visual_odometry.sequence import StereoSequence, read_sequence

@@ -28,8 +28,8 @@ from consistency.referee.defaults import DETECT
 from consistency.referee.diagnostics.nees import binomial_interval
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import folds_of, judged_by
-from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.motion_windows import PLANE, SPACE, DriveWindows, cut_windows, span_of
+from consistency.referee.fit_covariance.drives import PLANE, SPACE, Drive, DriveWindows, cut_windows, drive_of, span_of
+from consistency.referee.fit_covariance.mean_and_noise import fit_noise, terms_of, variance_intervals
 from consistency.referee.fit_covariance.noise_model import decided
 from consistency.referee.fit_covariance.refusals import (
     doubts,
@@ -38,7 +38,6 @@ from consistency.referee.fit_covariance.refusals import (
     require_sound,
     rotation_growth,
 )
-from consistency.referee.fit_covariance.white_noise import fit_noise, terms_of, variance_intervals
 from consistency.referee.geometry import composed, matrices, vectors
 from consistency.referee.types import Array
 

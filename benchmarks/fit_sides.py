@@ -22,10 +22,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from script_options import options_of
 
-from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
-from consistency.referee.fit_covariance.systematic_errors import MeanFit
-from consistency.referee.fit_covariance.white_noise import fit_noise, jitter_of
+from consistency.referee.fit_covariance.drives import Drive, cut_windows, span_of
+from consistency.referee.fit_covariance.mean_and_noise import MeanFit, fit_noise, jitter_of
 from consistency.referee.geometry import composed, matrices
 from consistency.referee.types import Array
 

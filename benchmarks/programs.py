@@ -33,7 +33,7 @@ from consistency.referee.programs.process import program_of
 from consistency.referee.programs.study import ProgramPlan, run_study
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.program_runs import ProgramRuns
-from consistency.referee.system.progress import quiet
+from consistency.referee.system import quiet
 
 STATE = ("a", "b", "c")
 STEPS = 10

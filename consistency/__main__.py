@@ -57,7 +57,7 @@ def main() -> NoReturn:
 
 def _stop(number: int, _: Any = None) -> NoReturn:
     """Say so in one line and end at once; an exception would be swallowed by serialisers and compilers."""
-    for end in getattr(sys.modules.get("consistency.referee.system.stopping"), "AT_STOP", ()):
+    for end in getattr(sys.modules.get("consistency.referee.system"), "AT_STOP", ()):
         end()
     if number != signal.SIGINT and sys.argv[1:2] != ["monte-carlo"]:  # as it would have ended by itself
         signal.signal(number, signal.SIG_DFL)

@@ -217,7 +217,7 @@ def assert_program_consistent(
 
     demand = terms(false_alarm, detect, power, allow, tolerance, lost)
     settings = _settings(demand.planned, demand)
-    record = record_of_program(argv, settings, runs, estimates, truth, out, filter, **options)
+    record = record_of_program(argv, settings, runs, estimates, truth, out, filter, options)
     return _judged("assert_program_consistent", record, demand)
 
 

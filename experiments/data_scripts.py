@@ -10,7 +10,7 @@ from pathlib import Path
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import findings_table
 from consistency.referee.show.terminal import show
-from consistency.referee.system.folders import require_free
+from consistency.referee.system import require_free
 
 
 def options_of(

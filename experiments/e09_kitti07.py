@@ -33,7 +33,7 @@ from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
 from consistency.diagnostics import anees_interval, chi2_mean_interval
 from consistency.referee.diagnostics.nees import coverage
-from consistency.referee.system.folders import manifest_of
+from consistency.referee.system import manifest_of
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
 from consistency.diagnostics import Verdict, judge, make_record
 from consistency.referee.diagnostics.nees import nees
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import write_whole
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.odometry import SHARED, fit_shared, sensitivities
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, RelativeMotion, diagonal_covariances

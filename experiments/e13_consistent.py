@@ -16,7 +16,7 @@ from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.reproduce_findings import script, sibling
 from consistency.bench.runs.results_to_records import log_rmse, record_of
 from consistency.bench.scenario import UniformLandmarks
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 
 FINDINGS = (
     "consistent-at-9cm",

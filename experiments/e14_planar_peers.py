@@ -15,7 +15,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 
 FINDINGS = ("planar-esde", "planar-iekf-slam", "planar-ocekf-slam", "planar-theory", "planar-limit")

@@ -23,7 +23,7 @@ from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.recorded_log import Log, write_log
-from consistency.referee.system.folders import manifest_of
+from consistency.referee.system import manifest_of
 
 if TYPE_CHECKING:
     import mrclam_log as conversion

@@ -7,7 +7,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script, sibling
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 
 FINDINGS = ("map-ceiling",)

@@ -12,7 +12,7 @@ from scipy.stats import ttest_rel
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script
 from consistency.bench.runs.results_to_records import log_rmse
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 
 FINDINGS = ("fig10a", "fig10b", "guarded", "fov", "feature-count", "near-far-mix")

@@ -14,7 +14,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import script, sibling
 from consistency.referee.errors import InputError
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.chain import MISMATCH, Chain, Stops, Tracks, stand, track_means
 from consistency.stereo.rendered_images.scene import Camera, Lens, StereoCamera

@@ -17,7 +17,7 @@ from scipy import stats
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, script, sibling
 from consistency.referee.errors import InputError
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 from consistency.stereo.rendered_images.chain import (
     DRIFTED,

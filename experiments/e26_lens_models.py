@@ -23,7 +23,7 @@ from consistency.bench.runs.reproduce_findings import OURS, script
 from consistency.bench.runs.results_to_records import mean_nees_of_runs
 from consistency.bench.scenario import PicturedSensor, UvdSensor
 from consistency.referee.errors import InputError
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 from consistency.stereo.characterising.boards import MODELS, find_corners, of_model
 from consistency.stereo.characterising.characterise import GRID, Characterisation

@@ -22,7 +22,7 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench.runs.reproduce_findings import OURS, command_line, sibling
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 from consistency.stereo.visual_odometry.arrays import ConsensusError, opencv
 from consistency.stereo.visual_odometry.relative_motion import MotionSettings, estimate_motion

@@ -16,7 +16,7 @@ from consistency.bench.filters.textbook.inverse_range import Corrections
 from consistency.bench.filters.textbook.robocentric import RobotCentredKalman
 from consistency.bench.runs.reproduce_findings import script
 from consistency.bench.runs.results_to_records import log_rmse, mean_nees_of_runs, record_of
-from consistency.referee.system.progress import each
+from consistency.referee.system import each
 from consistency.referee.types import Array
 
 FINDINGS = ("consistent-elsewhere",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from consistency.referee.document.blocks import COLOURS, DASHES, TRUTH, Look
+from consistency.referee.show.blocks import COLOURS, DASHES, TRUTH, Look
 from consistency.referee.show.figures import WIDTH, canvas, dots, path, png, points
 from consistency.referee.types import Array
 

@@ -23,7 +23,7 @@ from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, M
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import manifest_of, require_free
+from consistency.referee.system import manifest_of, require_free
 from consistency.referee.types import Array
 from consistency.stereo.frontend.images_to_log import (
     CAMERA,

@@ -152,7 +152,7 @@ def _run(arguments: list[str] | None) -> Any:
         _drop_output()
         sys.exit(141)
     except OSError as error:
-        from consistency.referee.system.stopping import FULL
+        from consistency.referee.system import FULL
 
         if error.filename is None and error.errno not in FULL:
             raise
@@ -182,7 +182,7 @@ def _show_help(arguments: list[str] | None) -> bool:
 
 def _end(sentence: str, status: int) -> NoReturn:
     from consistency.referee.parsing import one_line
-    from consistency.referee.system.progress import say
+    from consistency.referee.system import say
 
     say(f"consistency: {one_line(sentence, 4000)}")
     try:

@@ -83,7 +83,7 @@ def fit_covariance_command(
     from consistency.referee.fit_covariance.drives import read_drives
     from consistency.referee.fit_covariance.noise_model import fit_covariance as fit
     from consistency.referee.fit_covariance.noise_model import noise_document
-    from consistency.referee.system.folders import require_free
+    from consistency.referee.system import require_free
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_written(overwrite, out, "--out")
@@ -151,7 +151,7 @@ def correct_command(
     from consistency.referee.fit_covariance.correct import correct, correction_document, the_record
     from consistency.referee.fit_covariance.correct_bounds import BoundCorrection, bound_correction_document
     from consistency.referee.readers.formats.restated import text_files
-    from consistency.referee.system.folders import require_free
+    from consistency.referee.system import require_free
     from consistency.referee.verdicts.judge_sources import skip_asked
 
     require_word("--per", per, "axis")

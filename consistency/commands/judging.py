@@ -36,7 +36,7 @@ from consistency.commands.shared_options import (
     tell_notes,
 )
 from consistency.referee.column_names import POSE
-from consistency.referee.defaults import DETECT, FALSE_ALARM, GATE_FALSE_ALARM, POWER
+from consistency.referee.defaults import DETECT, FALSE_ALARM, GATE_FALSE_ALARM, NIS_TOLERANCE, POWER
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import GROUPED, Reading, flag_of
@@ -44,7 +44,6 @@ from consistency.referee.readers.options import GROUPED, Reading, flag_of
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.record import Record
     from consistency.referee.diagnostics.record import Skip as FirstSteps
-    from consistency.referee.readers.formats.innovation_files import NisLog
     from consistency.referee.verdicts.compare_sources import Baseline
     from consistency.referee.verdicts.judge_sources import Source
 
@@ -101,9 +100,9 @@ def analyse_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files other than reports, too.")] = False,
 ) -> None:
     """Check whether stated covariances match the errors. Explain the verdict."""
-    from consistency.referee.document.tables import document
     from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.judge_sources import files_source, judge_all, settings_of, skip_asked
+    from consistency.referee.verdicts.tables import document
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")
@@ -269,8 +268,8 @@ def plan_command(
     as_json: AsJson = False,
 ) -> None:
     """Compute how many runs a verdict needs. Without a pilot, the number holds however steps depend on each other."""
-    from consistency.referee.document.tables import bound_plan_lines, plan_lines
     from consistency.referee.verdicts.judge_sources import pilots_of_records, plan_of_bounds, plan_runs
+    from consistency.referee.verdicts.tables import bound_plan_lines, plan_lines
 
     if level is not None:
         if scenario is not None or like is not None or lost is not None or groups is not None or allow is not None:
@@ -423,7 +422,7 @@ def monitor_command(
     ] = GATE_FALSE_ALARM,
     tolerance: Annotated[
         float, typer.Option("--tolerance", help="Accept scales of the NIS up to this ratio; 1 is the exact test.")
-    ] = 1.2,
+    ] = NIS_TOLERANCE,
     gate: Annotated[
         str | None,
         typer.Option(
@@ -449,12 +448,14 @@ def monitor_command(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit with status 1 on an alarm.")] = None,
 ) -> None:
     """Watch the innovations of a deployed filter. Raise an alarm if their size is not what the filter states."""
-    from consistency.referee.document.alarms import monitor_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.flight_logs import STATED, is_dataflash
+    from consistency.referee.readers.formats.innovation_files import refuse_options
     from consistency.referee.verdicts.judge_sources import skip_asked
     from consistency.referee.verdicts.monitor_sources import (
         make_monitor,
+        monitor_document,
+        read_innovations,
         refuse_bags,
         skip_first,
         watch,
@@ -479,7 +480,14 @@ def monitor_command(
             raise InputError(f"--{next(iter(options))}: does not go with lines as they come (-)")
         watched = watch_lines(sys.stdin, "stdin", watcher, partial(print, file=sys.stderr, flush=True), files)
     else:
-        log = skip_first(_read_innovations(Path(path), filter_name, run, files), first)
+        if Path(path).is_dir():
+            from consistency.bench.runs.results_to_records import innovations_of
+
+            refuse_options(Path(path), files)
+            log = innovations_of(Path(path), filter_name, run)
+        else:
+            log = read_innovations(Path(path), filter_name, run, files)
+        log = skip_first(log, first)
         tell(log.notes)
         if plot is not None:
             require_plot(plot, overwrite)
@@ -498,26 +506,13 @@ def monitor_command(
         raise typer.Exit(1)
 
 
-def _read_innovations(path: Path, filter_name: str | None, run: int | None, files: Reading) -> NisLog:
-    """Return the innovations of one run in a file, or in a folder of results."""
-    if path.is_dir():
-        from consistency.bench.runs.results_to_records import innovations_of
-        from consistency.referee.readers.formats.innovation_files import refuse_options
-
-        refuse_options(path, files)
-        return innovations_of(path, filter_name, run)
-    from consistency.referee.verdicts.monitor_sources import read_innovations
-
-    return read_innovations(path, filter_name, run, files)
-
-
 def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.document.alarms import ratios_document
     from consistency.referee.pages.write_pages import plotted, require_plot
     from consistency.referee.readers.formats.flight_logs import read_ratios
+    from consistency.referee.verdicts.monitor_sources import ratios_document
 
     if plot is not None:
         require_plot(plot, overwrite)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Document
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, remedy
 from consistency.referee.pages.write_pages import is_one_file, require_report, write_file_reports, write_text_file
 from consistency.referee.show.as_json import render
+from consistency.referee.show.blocks import Document
 
 
 def require_reports(report: Path | None, junit: Path | None, overwrite: bool) -> None:

@@ -83,11 +83,11 @@ def monte_carlo_command(
     the call. The program writes estimates and truth there, as 'analyse' reads them.
     """
     from consistency.commands.program_reports import require_reports, write_verdicts
-    from consistency.referee.document.tables import document
     from consistency.referee.programs.process import inputs_of, program_of
     from consistency.referee.programs.study import ProgramPlan, run_study
     from consistency.referee.readers.pipeline.program_runs import failures_in_words
     from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
+    from consistency.referee.verdicts.tables import document
 
     require_word("--fail-on", fail_on, "inconsistent")
     require_word("--innovations", innovations, "optimal")

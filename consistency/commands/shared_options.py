@@ -16,7 +16,7 @@ from consistency.referee.readers.options import OPTIONS, VALUES, Option, Reading
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.record import Record
-    from consistency.referee.document.blocks import Document
+    from consistency.referee.show.blocks import Document
 
 
 def completed(values: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:

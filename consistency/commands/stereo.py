@@ -112,7 +112,7 @@ def characterise_command(
 ) -> None:
     """Measure a stereo sensor: noise, growth, bias, tails. Every number has an interval."""
     from consistency.referee.show import terminal
-    from consistency.referee.system.folders import require_free
+    from consistency.referee.system import require_free
     from consistency.stereo.characterising.sensor_text import as_json as json_of
     from consistency.stereo.characterising.sensor_text import (
         measured_sensor_toml,

@@ -117,9 +117,9 @@ def run_command(
     from consistency.bench.scenario import load_scenario
     from consistency.bench.store.recorded_log import read_log
     from consistency.bench.store.results import Results, StoredResults
-    from consistency.referee.document.tables import document
     from consistency.referee.show import terminal
-    from consistency.referee.system.progress import say
+    from consistency.referee.system import say
+    from consistency.referee.verdicts.tables import document
 
     if (scenario is None) == (log is None):
         raise InputError("give either a SCENARIO or --log DIR")
@@ -301,10 +301,10 @@ def tune_command(
     from consistency.bench.store.recorded_log import read_log
     from consistency.bench.tuning.tune import KIND, tuning_data, tuning_lines, tuning_verdicts, write
     from consistency.bench.tuning.tune import tune as tune_filter
-    from consistency.referee.document.tables import document
     from consistency.referee.show import terminal
-    from consistency.referee.system.folders import require_free
+    from consistency.referee.system import require_free
     from consistency.referee.verdicts.judge_sources import settings_of
+    from consistency.referee.verdicts.tables import document
 
     require_word("--fail-on", fail_on, "inconsistent")
     if (scenario is None) == (log is None):
@@ -407,7 +407,7 @@ def list_command(as_json: AsJson = False) -> None:
     """List scenarios, filters, experiments and sweeps."""
     from consistency.bench.filters import BOUNDS, SMOOTHERS, filter_summaries
     from consistency.bench.types import GUARDS
-    from consistency.referee.system.folders import summaries
+    from consistency.referee.system import summaries
 
     shipped, filters = summaries(), filter_summaries()
     if missing("bench"):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
-from consistency.referee.document.blocks import (
+from consistency.referee.pages.write_pages import facts, write_document, write_file
+from consistency.referee.show.blocks import (
     BAND,
     COLOURS,
     EXPECTED,
@@ -22,9 +23,8 @@ from consistency.referee.document.blocks import (
     Text,
     style,
 )
-from consistency.referee.pages.write_pages import facts, write_document, write_file
 from consistency.referee.show.figures import add_legend, band, canvas, dots, log_axis, stroke
-from consistency.referee.system.folders import manifest_of, write_folder
+from consistency.referee.system import manifest_of, write_folder
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import NAMES, Characterisation
 from consistency.stereo.characterising.sensor_text import counted, estimates_table, sentences

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx_gallery.scrapers import figure_rst
 
-from consistency.referee.system.progress import quiet
+from consistency.referee.system import quiet
 
 LOOK = {
     "axes.linewidth": 0.7,

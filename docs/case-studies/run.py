@@ -115,8 +115,7 @@ def main() -> None:
     if Path(sys.prefix) != ROOT / ".env-new":  # which has the core, for the progress bar
         names = [environment(name) for name in SETS]
         raise SystemExit(subprocess.run([names[0], __file__, *sys.argv[1:]], check=False).returncode)
-    from consistency.referee.system.progress import progress
-    from consistency.referee.system.stopping import write_whole
+    from consistency.referee.system import progress, write_whole
 
     kept = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {"studies": {}, "rates": {}}
     work = [(case, name) for case in asked.only or cases() for name in SETS if name == "new" or case in OLD]

@@ -10,8 +10,8 @@ import pandas as pd
 
 from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import ACCEPTED, BAND, EXPECTED, LIMIT, REJECTED, Figure, style
 from consistency.referee.errors import InputError
+from consistency.referee.show.blocks import ACCEPTED, BAND, EXPECTED, LIMIT, REJECTED, Figure, style
 from consistency.referee.show.figures import (
     add_legend,
     canvas,

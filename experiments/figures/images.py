@@ -24,7 +24,7 @@ from consistency.bench.pages.sections.published_findings import (
     single,
 )
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import BAND, EXPECTED, LIMIT, Block, Figure, Look, Table, style
+from consistency.referee.show.blocks import BAND, EXPECTED, LIMIT, Block, Figure, Look, Table, style
 from consistency.referee.show.figures import curve, dots, log_axis, stroke
 from consistency.referee.types import Array
 

@@ -23,7 +23,7 @@ from consistency.bench.pages.sections.published_findings import (
     single,
 )
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import COLOURS, EXPECTED, Block, Figure, Look, Table, style
+from consistency.referee.show.blocks import COLOURS, EXPECTED, Block, Figure, Look, Table, style
 from consistency.referee.show.figures import curve, edges, log_axis, stroke
 
 if TYPE_CHECKING:

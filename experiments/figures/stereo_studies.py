@@ -6,7 +6,7 @@ import pandas as pd
 
 from consistency.bench.pages.sections.published_findings import Exhibit, Source, exhibit_blocks, listing
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import Block, Table
+from consistency.referee.show.blocks import Block, Table
 
 CHAPTER = ("fig13", "Fig. 13: the average NEES in several studies", "Fig. 13")
 ON_PAPER = True  # of a report of several studies

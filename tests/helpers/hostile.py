@@ -25,7 +25,7 @@ from consistency.bench.store.parquet import Rejected, noted_table
 from consistency.bench.store.recorded_log import read_log
 from consistency.commands import main
 from consistency.referee.readers.formats.kitti_files import read_drive
-from consistency.referee.system.folders import manifest_of
+from consistency.referee.system import manifest_of
 from consistency.referee.types import Failure
 
 RUNS, STEPS, LANDMARKS = 9, 12, 5

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.patches import PathPatch
 
-from consistency.referee.document.blocks import Document, Figure
+from consistency.referee.show.blocks import Document, Figure
 from consistency.referee.show.figures import drawn
 
 

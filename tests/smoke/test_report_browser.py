@@ -19,13 +19,12 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.commands import main
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.document.alarms import monitor_document
-from consistency.referee.document.blocks import Chapter, Document, Figure
 from consistency.referee.pages.record_figures import monitor_drawing
 from consistency.referee.pages.verdicts import MARKS
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show import as_html
-from consistency.referee.verdicts.monitor_sources import make_monitor, watch
+from consistency.referee.show.blocks import Chapter, Document, Figure
+from consistency.referee.verdicts.monitor_sources import make_monitor, monitor_document, watch
 
 pytestmark = pytest.mark.browser
 ROOT = Path(__file__).parents[2]

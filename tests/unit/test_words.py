@@ -22,9 +22,9 @@ from consistency.referee.diagnostics.number_words import off_by, p_text, plural,
 from consistency.referee.diagnostics.tails import outliers
 from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.document.blocks import Reasons, fragment
-from consistency.referee.document.tables import reason
+from consistency.referee.show.blocks import Reasons, fragment
 from consistency.referee.types import Failure
+from consistency.referee.verdicts.tables import reason
 
 SURE = 1e-5
 ALARMS = ("overconfident", "conservative", "biased", "heavy-tailed", "inconsistent")

@@ -181,7 +181,7 @@ def compare(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
 
 def markdown(verdict: str, rows: list[Row], why: str = "") -> str:
     """The summary of the job."""
-    from consistency.referee.document.blocks import Column, Document, table
+    from consistency.referee.show.blocks import Column, Document, table
     from consistency.referee.show.as_md import render
 
     heads = tuple(map(Column, ("what", "verdict", "ratio of covariances", "runs", "why")))

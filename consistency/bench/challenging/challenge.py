@@ -45,8 +45,7 @@ from consistency.referee.diagnostics.number_words import p_text
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import JOINT, SCALE, Settings
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import writing
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import write_whole, writing
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import refused
 

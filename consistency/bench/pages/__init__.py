@@ -35,12 +35,12 @@ def write_reports(folder: Path, html: Path | None, pdf: Path | None, overwrite: 
     InputError
         The folder cannot be read, or a file exists or cannot be written.
     """
-    from consistency.referee.system.folders import read_manifest
+    from consistency.referee.system import read_manifest
 
     manifest = read_manifest(Path(folder))
     require_pages(html, pdf, overwrite)
     from consistency.bench.pages.results_report import build_report, compose, folders_of
-    from consistency.referee.system.progress import progress
+    from consistency.referee.system import progress
 
     parts = len(folders_of(Path(folder), manifest)) + sum(path is not None for path in (html, pdf))
     with progress("report", parts, "parts", brief=True) as advance:

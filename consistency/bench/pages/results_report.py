@@ -23,11 +23,10 @@ from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.number_words import names_in_a_row, plural
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Settings
-from consistency.referee.document.blocks import Chapter, Document, Status, badges
 from consistency.referee.errors import InputError
 from consistency.referee.pages.verdicts import time_axis_of
-from consistency.referee.system.folders import read_manifest
-from consistency.referee.system.progress import Advance
+from consistency.referee.show.blocks import Chapter, Document, Status, badges
+from consistency.referee.system import Advance, read_manifest
 
 LISTED = 6  # filters that the first paragraph names one by one
 

@@ -19,7 +19,8 @@ from consistency.bench.sweeps.sweep_file import Axis as GridAxis
 from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import values_of
 from consistency.referee.diagnostics.number_words import names_in_a_row
-from consistency.referee.document.blocks import (
+from consistency.referee.pages.write_pages import facts
+from consistency.referee.show.blocks import (
     EXPECTED,
     OVER,
     RIGHT,
@@ -43,7 +44,6 @@ from consistency.referee.document.blocks import (
     style,
     table,
 )
-from consistency.referee.pages.write_pages import facts
 from consistency.referee.show.figures import TITLE, add_legend, canvas, dots, log_axis, say, stroke, wrapped
 
 if TYPE_CHECKING:

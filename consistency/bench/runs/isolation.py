@@ -35,7 +35,7 @@ from consistency.bench.runs.process_start import begin, nothing
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.stopping import link_to_parent
+from consistency.referee.system import link_to_parent
 
 try:
     import resource

@@ -35,8 +35,7 @@ from consistency.referee.diagnostics.planning import Design, sequential_design
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import manifest_of, require_free
-from consistency.referee.system.progress import say
+from consistency.referee.system import manifest_of, require_free, say
 from consistency.referee.verdicts.judge_sources import refused
 
 

@@ -44,9 +44,7 @@ from consistency.bench.store.results import (
 )
 from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import NewFolder, in_words, manifest_of, this_machine
-from consistency.referee.system.progress import progress, say
-from consistency.referee.system.stopping import away_from_signals
+from consistency.referee.system import NewFolder, away_from_signals, in_words, manifest_of, progress, say, this_machine
 from consistency.referee.types import Failure
 
 PLAN = "until_decided"

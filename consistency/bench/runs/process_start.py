@@ -7,7 +7,7 @@ import os
 import signal
 from multiprocessing.connection import Connection
 
-from consistency.referee.system.stopping import end_with_parent
+from consistency.referee.system import end_with_parent
 
 try:
     import resource

@@ -29,13 +29,11 @@ from consistency.bench.types import OURS as OURS
 from consistency.bench.types import Finding, outcome
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Cell, Column, Status, Table, table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import read_json, reading
+from consistency.referee.show.blocks import Cell, Column, Status, Table, table
 from consistency.referee.show.terminal import show
-from consistency.referee.system.folders import manifest_of, require_free
-from consistency.referee.system.progress import quiet, say
-from consistency.referee.system.stopping import end_with_parent, link_to_parent
+from consistency.referee.system import end_with_parent, link_to_parent, manifest_of, quiet, require_free, say
 
 _Contribution: TypeAlias = tuple[list[Finding], dict[str, pd.DataFrame]]  # findings and tables of one script
 WAITING = 30.0  # seconds between lines on a process that is waited for

@@ -40,8 +40,7 @@ from consistency.referee.diagnostics.whitening import whiten
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import planar_error, planar_map_error, pose_error
 from consistency.referee.parsing import LARGEST_NUMBER
-from consistency.referee.system import progress
-from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent
+from consistency.referee.system import announce, away_from_signals, end_with_parent, link_to_parent, say
 from consistency.referee.types import Array, Failure
 
 NAMED = 3  # filters that are named where several are compiled
@@ -319,7 +318,7 @@ def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
             need = Need(filter_, trial, belief, filter_.outlook(trial, belief))
             needs.setdefault(need.outlook.key, need)
         elif isinstance(filter_, WholeTrial) and not filter_.is_ready(trial, belief):
-            progress.say(f"compiling {name_of(filter_)}")
+            say(f"compiling {name_of(filter_)}")
             filter_.compile(trial, belief)
     missing = [need for need in needs.values() if not need.outlook.is_ready]
     if missing:
@@ -327,7 +326,7 @@ def compile_all(wanted: Iterable[Wanted], jobs: int = 1) -> list[Need]:
         workers = min(jobs, len(shared_kernels))
         if jit.folder_fault():
             workers = 1
-        progress.announce(f"{_label(missing)}, once: {EACH}")
+        announce(f"{_label(missing)}, once: {EACH}")
         if workers > 1:
             _compile_side_by_side(shared_kernels, workers)
         away_from_signals(_compile_here, missing)

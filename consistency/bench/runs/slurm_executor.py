@@ -19,7 +19,7 @@ import submitit
 from consistency.bench.runs.workers import worker_count
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line
-from consistency.referee.system.progress import say
+from consistency.referee.system import say
 
 Result = TypeVar("Result")
 Call = tuple[Future[Any], Callable[[], Any]]

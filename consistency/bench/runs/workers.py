@@ -32,8 +32,7 @@ from consistency.bench.filters.run_filter import RunRecord, reason_of
 from consistency.bench.runs.run_outcome import Outcomes, Recorded, RunOutcome, TrialWork, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import digest_of_sources, in_words, this_machine
-from consistency.referee.system.progress import say
+from consistency.referee.system import digest_of_sources, in_words, say, this_machine
 
 CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container or a control group, "max" where there is none
 COPIES = 4  # covariances of the whole state: the filter's, the joint one it returns, and two to score the map

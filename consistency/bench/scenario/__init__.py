@@ -32,7 +32,7 @@ from consistency.bench.scenario.truth_and_belief import (
     scenario_text,
     toml_text,
 )
-from consistency.referee.system.folders import data_folder
+from consistency.referee.system import data_folder
 
 __all__ = [
     "PLANAR_SENSORS",

@@ -28,7 +28,7 @@ from consistency.bench.scenario.toml_tables import (
 )
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_folder, one_line
-from consistency.referee.system.folders import data_folder
+from consistency.referee.system import data_folder
 
 Share = Annotated[float, Field(gt=0, lt=1, strict=True)]
 # keys of both halves; of the second kind one half may have what the other leaves out

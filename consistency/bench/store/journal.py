@@ -19,8 +19,7 @@ from filelock import FileLock, Timeout
 
 from consistency.bench.store.parquet import Columns
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import require_free, unfinished_of, writing
-from consistency.referee.system.stopping import make_durable
+from consistency.referee.system import make_durable, require_free, unfinished_of, writing
 from consistency.referee.types import Array
 
 CHECKPOINT_EVERY = 5.0  # s: a power cut costs at most the runs of so long, a killed process none

@@ -16,12 +16,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from consistency.bench.types import Trial
+from consistency.referee import system
 from consistency.referee.column_names import COLUMNS, OWN_COVARIANCE, POSE
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, LARGEST_NUMBER, MOST_DOF, WHOLE, is_file, one_line, reading
 from consistency.referee.readers.formats.parquet_file import open_parquet
-from consistency.referee.system import folders
-from consistency.referee.system.folders import NewFolder
+from consistency.referee.system import NewFolder
 from consistency.referee.types import Array, Failure
 
 OPTIONAL = {  # columns of a table that may be missing
@@ -277,7 +277,7 @@ def write_tables(
     overwrite: bool = False,
     keep_others: bool = False,
 ) -> None:
-    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as :func:`folders.write_folder`."""
+    """Tables as Parquet, the manifest, and whatever ``extra`` writes, as :func:`system.write_folder`."""
 
     def contents(at: Path) -> None:
         for name, table in tables.items():
@@ -285,7 +285,7 @@ def write_tables(
         if extra is not None:
             extra(at)
 
-    folders.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
+    system.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
 
 
 def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:

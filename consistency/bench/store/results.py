@@ -27,7 +27,7 @@ from consistency.referee.column_names import COLUMNS
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.parsing import one_line, reading, require_name
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.system import read_manifest
 from consistency.referee.types import Indices
 
 NUMBERS = [column for column in COLUMNS["estimates"] if column != "filter"]

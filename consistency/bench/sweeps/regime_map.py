@@ -27,11 +27,11 @@ from consistency.bench.sweeps.sweep_file import Cell as GridCell
 from consistency.bench.sweeps.sweep_file import Sweep, values_of
 from consistency.referee.diagnostics.number_words import short
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.document.blocks import NONE, Block, Cell, Column, Status, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.pages.write_pages import write_file
 from consistency.referee.parsing import read_json, reading
-from consistency.referee.system.folders import SCHEMA_VERSION, manifest_of
+from consistency.referee.show.blocks import NONE, Block, Cell, Column, Status, Table, Text, table
+from consistency.referee.system import SCHEMA_VERSION, manifest_of
 
 MAP_KIND = "map"
 SHIPPED = "regime.json"

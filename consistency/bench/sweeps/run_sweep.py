@@ -36,9 +36,15 @@ from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import reading
-from consistency.referee.system.folders import digest_of_sources, manifest_of, read_manifest, unfinished_of
-from consistency.referee.system.progress import quiet, say
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import (
+    digest_of_sources,
+    manifest_of,
+    quiet,
+    read_manifest,
+    say,
+    unfinished_of,
+    write_whole,
+)
 
 PAUSE = 1.0  # s, between looks at whether another process has done what is left
 KIND, CELL_KIND = "sweep", "cell"

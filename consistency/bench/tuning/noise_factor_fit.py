@@ -33,7 +33,7 @@ from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.errors import InputError
-from consistency.referee.system.progress import say
+from consistency.referee.system import say
 from consistency.referee.types import Array
 
 LIMIT = float(np.log(1e4))  # factors that are tried lie within 1e-4 and 1e4

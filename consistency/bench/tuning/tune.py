@@ -41,8 +41,7 @@ from consistency.referee.diagnostics.number_words import short
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval, Settings
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import manifest_of
-from consistency.referee.system.progress import quiet
+from consistency.referee.system import manifest_of, quiet
 from consistency.referee.types import Array
 
 OTHER_STARTS = (10.0, 0.1, 100.0)  # common factors to begin with where a run fails at the one that the data ask for

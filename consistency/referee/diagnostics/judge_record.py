@@ -68,7 +68,7 @@ def judge(
     if record.errors.bounds:
         from consistency.referee.diagnostics.bounds import findings_of_bounds
 
-        return _whole(record, findings_of_bounds(record, settings), record=kept)
+        return _whole(record, findings_of_bounds(record, settings), kept)
     evidence = record.as_runs
     truth = None
     unshown = record.origin.unshown
@@ -87,21 +87,29 @@ def judge(
         found = findings_of(evidence, settings, truth=truth, unshown=unshown)
     world = None
     if record.world is not None:
-        in_world = findings_of(record.in_world, settings)
-        world = _verdict(in_world, reasons(in_world))
-    return _whole(
-        record, found, world=world, map=_map_of(record, settings), rejection=_rejections_of(record), record=kept
-    )
+        world = _verdict(findings_of(record.in_world, settings))
+    return _whole(record, found, kept, world, _map_of(record, settings), _rejections_of(record))
 
 
-def _verdict(found: Findings, sentences: Sequence[str], **beside: Any) -> Verdict:
-    """The findings with the ``sentences`` that say them, and what stands ``beside`` them."""
-    fields = vars(found) | {"parts": {name: _verdict(part, reasons(part)) for name, part in found.parts.items()}}
-    fields |= {"reasons": tuple(sentences), "details": tuple(details(found)), "axis": deciding_axis(found)}
-    return Verdict(**fields | beside)
+def _verdict(found: Findings) -> Verdict:
+    """The findings with the sentences that say them."""
+    return Verdict(**_in_words(found), reasons=tuple(reasons(found)))
 
 
-def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
+def _in_words(found: Findings) -> dict[str, Any]:
+    """Fields of a verdict that follow from its findings, but for the reasons."""
+    parts = {name: _verdict(part) for name, part in found.parts.items()}
+    return {**vars(found), "parts": parts, "details": tuple(details(found)), "axis": deciding_axis(found)}
+
+
+def _whole(
+    judged: Record,
+    found: Findings,
+    kept: Record | None,
+    world: Verdict | None = None,
+    map: MapScore | None = None,
+    rejection: RejectionScore | None = None,
+) -> Verdict:
     """The verdict on a record: its findings in words, and what stands beside its errors and innovations."""
     sentence, *figures = reasons(found)
     if judged.fit.caption:
@@ -114,15 +122,17 @@ def _whole(judged: Record, found: Findings, **beside: Any) -> Verdict:
     if judged.fit.align:
         left_out.update(judged.left_out_steps)
     causes = (*judged.origin.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
-    return _verdict(
-        found,
-        [sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)],
-        left_out_steps=tuple(sorted(left_out)),
+    return Verdict(
+        **_in_words(found) | {"left_out_steps": tuple(sorted(left_out))},
+        reasons=(sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)),
         convention=convention,
         align=align,
         notes=tuple(judged.origin.notes),
         causes=causes,
-        **beside,
+        world=world,
+        map=map,
+        rejection=rejection,
+        record=kept,
     )
 
 
@@ -174,8 +184,7 @@ def _map_of(record: Record, settings: Settings | None = None) -> MapScore | None
     verdict = None
     of_map = landmarks.record(last_nees(record))
     if of_map is not None:
-        found = findings_of(of_map, settings)
-        verdict = _verdict(found, reasons(found))
+        verdict = _verdict(findings_of(of_map, settings))
     return map_score(landmarks.run, landmarks.nees, landmarks.dof, verdict)
 
 
@@ -322,9 +331,7 @@ def _of_look(design: Design, evidence: Record, runs: int, found: Findings, kept:
             of_world, fit=replace(of_world.fit, caption=""), origin=replace(of_world.origin, causes=(), notes=())
         )
         world, _ = follow(design, errors.first_runs, runs)
-    return _whole(
-        evidence, found, world=world, map=_map_of(evidence), rejection=_rejections_of(evidence, runs), record=kept
-    )
+    return _whole(evidence, found, kept, world, _map_of(evidence), _rejections_of(evidence, runs))
 
 
 def _p_of_scale(design: Design, evidence: Record) -> list[float]:

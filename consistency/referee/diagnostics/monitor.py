@@ -15,7 +15,7 @@ import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
-from consistency.referee.defaults import FALSE_ALARM, GATE_FALSE_ALARM
+from consistency.referee.defaults import FALSE_ALARM, GATE_FALSE_ALARM, NIS_TOLERANCE
 from consistency.referee.diagnostics import distributions
 from consistency.referee.types import Array
 
@@ -109,7 +109,7 @@ def alternatives(tolerance: float) -> tuple[tuple[float, float], ...]:
     return (*above, *((1.0 / scale, 1.0 / edge) for scale, edge in above))
 
 
-def bet_on(dof: int, tolerance: float = 1.2, gate: float | None = None) -> Bet:
+def bet_on(dof: int, tolerance: float = NIS_TOLERANCE, gate: float | None = None) -> Bet:
     """Bet for an innovation of ``dof`` degrees of freedom; see :class:`Monitor` for the formula."""
     limit = math.inf
     terms: list[tuple[float, float]] = []
@@ -210,7 +210,7 @@ class Monitor:
     def __init__(
         self,
         false_alarm: float = GATE_FALSE_ALARM,
-        tolerance: float = 1.2,
+        tolerance: float = NIS_TOLERANCE,
         gate: float | None = None,
         mission: int | None = None,
     ) -> None:

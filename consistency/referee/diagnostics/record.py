@@ -499,7 +499,7 @@ def numbered_axes(n: int) -> tuple[str, ...]:
 
 def shown_by(function: str, *arguments: Any) -> Any:
     """Result of a function that draws or describes; its module is loaded here, as nothing else needs it."""
-    return getattr(import_module("consistency.referee.notebook.read_and_judge"), function)(*arguments)
+    return getattr(import_module("consistency.referee.notebook"), function)(*arguments)
 
 
 def arrays_of(record: Record) -> dict[str, Any]:

@@ -61,7 +61,8 @@ def left_covariances(residuals: Sequence[Array], bases: Sequence[Array], shared:
     every = kernels
     if not shared:
         every = np.concatenate([kernels, _slower(longest)])
-    seen = np.array([_binned(_products(r), edges) for r in residuals])  # (N, n, bins)
+    # sums of r_k r_k+l, (N, n, bins)
+    seen = np.array([_binned(_lags(np.square(np.abs(_spectrum(r))), len(r)), edges) for r in residuals])
     pairs = np.array([_binned(np.maximum(len(r) - np.arange(longest), 0.0), edges) for r in residuals])  # (N, bins)
     whole = _expected(bases, every, edges, shared)  # (N, n, bins, n, J)
     if not shared and _oscillate(seen, whole, pairs):
@@ -197,11 +198,6 @@ def _size(T: int) -> int:
 def _lags(spectrum: Array, T: int) -> Array:
     """Back from a product of spectra to lags, the last axis: (F, ...) -> (..., T)."""
     return np.moveaxis(fft.irfft(spectrum, _size(T), axis=0)[:T], 0, -1)
-
-
-def _products(r: Array) -> Array:
-    """Sums of r_k r_k+l by component and lag, (T, n) -> (n, T)."""
-    return _lags(np.square(np.abs(_spectrum(r))), len(r))
 
 
 def _times(kernels: Array, Q: Array) -> Array:

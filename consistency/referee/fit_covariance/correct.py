@@ -23,7 +23,6 @@ from consistency.referee.diagnostics.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.whitening import squared_length, whiten
-from consistency.referee.document.blocks import Block, Column, Document, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.correct_bounds import BoundCorrection, correct_bounds
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, fitted_and_judged, require_fixed_groups, shown
@@ -43,7 +42,8 @@ from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_arrays
 from consistency.referee.readers.pipeline.read_files import checked_options
 from consistency.referee.readers.pipeline.relative_motions import rows_as_declared
-from consistency.referee.system.progress import progress
+from consistency.referee.show.blocks import Block, Column, Document, Table, Text, table
+from consistency.referee.system import progress
 from consistency.referee.types import Array, Indices
 from consistency.referee.verdicts.judge_sources import judge_all, source_of
 

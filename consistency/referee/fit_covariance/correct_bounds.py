@@ -18,9 +18,9 @@ from consistency.referee.diagnostics.number_words import percent, plural, short
 from consistency.referee.diagnostics.record import Bound, Map, Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import Block, Column, Document, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import IN_TURN, fitted_and_judged, require_fixed_groups
+from consistency.referee.show.blocks import Block, Column, Document, Text, table
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import judge_all
 

@@ -18,15 +18,15 @@ from consistency.referee.diagnostics.number_words import short
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
+from consistency.referee.fit_covariance.drives import BLOCKS, ENOUGH, DriveWindows
 from consistency.referee.fit_covariance.estimation import mean_over_runs
-from consistency.referee.fit_covariance.motion_windows import BLOCKS, ENOUGH, DriveWindows
-from consistency.referee.fit_covariance.white_noise import WhiteNoise
+from consistency.referee.fit_covariance.mean_and_noise import WhiteNoise
 from consistency.referee.geometry import composed, propagated, to_left, vectors
 from consistency.referee.readers.pipeline.relative_motions import relative_recording
 from consistency.referee.readers.places import Places, listed
 from consistency.referee.readers.runs_to_record import Relative
 from consistency.referee.readers.truth_matching import Poses, make_poses
-from consistency.referee.system.progress import with_progress
+from consistency.referee.system import with_progress
 from consistency.referee.types import Array, Indices
 
 DECIDE = 50  # windows that decide where drives are fewer than ENOUGH

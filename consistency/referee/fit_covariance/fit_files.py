@@ -16,7 +16,6 @@ import numpy as np
 
 from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.diagnostics.record import Record
-from consistency.referee.document.blocks import Chapter, Document, Figure, Status, Text
 from consistency.referee.fit_covariance.correct import (
     ByGroup,
     Correction,
@@ -33,15 +32,16 @@ from consistency.referee.fit_covariance.correct_bounds import (
     data_of_bounds,
 )
 from consistency.referee.fit_covariance.covariance_ratios import write_motions
+from consistency.referee.fit_covariance.drives import PIECES, ways
 from consistency.referee.fit_covariance.factors import stated_errors
-from consistency.referee.fit_covariance.motion_windows import PIECES, ways
 from consistency.referee.fit_covariance.noise_model import NoiseModel, correction, data_of_model, noise_document
 from consistency.referee.fit_covariance.pictures import draw_correction, draw_noise
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
 from consistency.referee.show import as_html, as_json
-from consistency.referee.system.folders import manifest_of, write_folder
+from consistency.referee.show.blocks import Chapter, Document, Figure, Status, Text
+from consistency.referee.system import manifest_of, write_folder
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:

@@ -17,7 +17,6 @@ from consistency.referee.diagnostics.judge_record import judge
 from consistency.referee.diagnostics.number_words import plural, short
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import (
     DECIDE,
@@ -32,15 +31,25 @@ from consistency.referee.fit_covariance.covariance_ratios import (
     shown,
     stretches_of,
 )
-from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import (
+from consistency.referee.fit_covariance.drives import (
     ENOUGH,
     PIECES,
+    Drive,
     DriveWindows,
     cut_windows,
     motion_matrices,
     span_of,
     vectors_of,
+)
+from consistency.referee.fit_covariance.mean_and_noise import (
+    NEIGHBOURS,
+    STRONG,
+    Mean,
+    MeanFit,
+    WhiteNoise,
+    fit_noise,
+    jitter_of,
+    variance_intervals,
 )
 from consistency.referee.fit_covariance.refusals import (
     SHARED,
@@ -57,10 +66,9 @@ from consistency.referee.fit_covariance.refusals import (
     require_sound,
     rotation_growth,
 )
-from consistency.referee.fit_covariance.systematic_errors import NEIGHBOURS, STRONG, Mean, MeanFit
-from consistency.referee.fit_covariance.white_noise import WhiteNoise, fit_noise, jitter_of, variance_intervals
 from consistency.referee.geometry import log, matrices
 from consistency.referee.readers.truth_matching import Poses
+from consistency.referee.show.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
 from consistency.referee.types import Array
 
 SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at

@@ -10,11 +10,11 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.defaults import CONFIDENCE, DETECT
-from consistency.referee.document.blocks import BAND, EXPECTED, LIMIT, ZERO, solid, style
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan
+from consistency.referee.fit_covariance.drives import mean_square, span_of
 from consistency.referee.fit_covariance.estimation import nees_of
-from consistency.referee.fit_covariance.motion_windows import mean_square, span_of
 from consistency.referee.pages.record_figures import ellipse
+from consistency.referee.show.blocks import BAND, EXPECTED, LIMIT, ZERO, solid, style
 from consistency.referee.show.figures import (
     add_legend,
     canvas,

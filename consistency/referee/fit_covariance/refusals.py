@@ -14,11 +14,11 @@ import numpy as np
 from scipy import stats
 
 from consistency.referee.errors import InputError
-from consistency.referee.fit_covariance.drives import Drive
-from consistency.referee.fit_covariance.motion_windows import (
+from consistency.referee.fit_covariance.drives import (
     ENOUGH,
     ROUNDED,
     STILL,
+    Drive,
     DriveWindows,
     angles,
     mean_square,
@@ -29,9 +29,10 @@ from consistency.referee.fit_covariance.motion_windows import (
     vectors_of,
     ways,
 )
-from consistency.referee.fit_covariance.systematic_errors import (
+from consistency.referee.fit_covariance.mean_and_noise import (
     FORWARD,
     Mean,
+    WhiteNoise,
     fit_mean,
     jacobian_of_mean,
     left_by,
@@ -39,7 +40,6 @@ from consistency.referee.fit_covariance.systematic_errors import (
     normal_equations,
     scaled_inverse,
 )
-from consistency.referee.fit_covariance.white_noise import WhiteNoise
 from consistency.referee.geometry import inverse, log
 from consistency.referee.readers.pipeline.relative_motions import BENT
 from consistency.referee.types import Array, Indices

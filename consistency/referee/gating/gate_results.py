@@ -12,7 +12,10 @@ import numpy as np
 from consistency.referee.diagnostics.comparison import Comparison
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
-from consistency.referee.document.blocks import (
+from consistency.referee.gating.checked_input import planned_detect, planned_dof, rate_shares
+from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
+from consistency.referee.show import rendered
+from consistency.referee.show.blocks import (
     Cell,
     Column,
     Document,
@@ -24,10 +27,7 @@ from consistency.referee.document.blocks import (
     fragment,
     table,
 )
-from consistency.referee.gating.checked_input import planned_detect, planned_dof, rate_shares
-from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
-from consistency.referee.show import rendered
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.system import write_whole
 
 NUMBERS = {"p", "false-alarm rate", "runs", "planned", "true / stated"}
 HEADS = (

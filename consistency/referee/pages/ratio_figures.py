@@ -11,8 +11,8 @@ import numpy as np
 from consistency.referee.diagnostics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.number_words import UNCERTAIN
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
 from consistency.referee.pages.verdicts import Judged
+from consistency.referee.show.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
 from consistency.referee.show.figures import add_legend, canvas, dodge, dots, intervals, log_axis, name_rows, stroke
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from consistency.referee.diagnostics.verdict_parts import SIDES, ByGroup, Group
-from consistency.referee.document.blocks import ACCEPTED, BAND, LOW, REJECTED, Look
+from consistency.referee.show.blocks import ACCEPTED, BAND, LOW, REJECTED, Look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

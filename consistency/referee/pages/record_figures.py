@@ -20,7 +20,10 @@ from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.uncertain_truth import of_both
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import (
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import CHARTS
+from consistency.referee.pages.verdicts import Clock, time_axis_of, wide
+from consistency.referee.show.blocks import (
     BAND,
     EXPECTED,
     LIMIT,
@@ -32,9 +35,6 @@ from consistency.referee.document.blocks import (
     Look,
     style,
 )
-from consistency.referee.errors import InputError
-from consistency.referee.geometry import CHARTS
-from consistency.referee.pages.verdicts import Clock, time_axis_of, wide
 from consistency.referee.show.figures import (
     WIDTH,
     add_legend,

@@ -15,8 +15,8 @@ from consistency.referee.diagnostics.bound_words import level_text
 from consistency.referee.diagnostics.number_words import names_in_a_row, plural, short
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import ABOUT, MAIN, Answer, BoundScore
-from consistency.referee.document import blocks
-from consistency.referee.document.blocks import (
+from consistency.referee.show import blocks
+from consistency.referee.show.blocks import (
     Block,
     Cell,
     Column,
@@ -32,8 +32,8 @@ from consistency.referee.document.blocks import (
     style,
     table,
 )
-from consistency.referee.document.tables import FILTER, cells, columns, known_measures, page, reason
 from consistency.referee.types import Array, Failure, Indices
+from consistency.referee.verdicts.tables import FILTER, cells, columns, known_measures, page, reason
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,7 +16,6 @@ import numpy as np
 from consistency.referee.diagnostics.number_words import plural, with_subject
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.document.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
@@ -25,14 +24,15 @@ from consistency.referee.pages.ratio_figures import bound_figures, by_axis, rati
 from consistency.referee.pages.record_figures import OVER_SIGMA, record_figures
 from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
 from consistency.referee.show import FORMATS, rendered
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.show.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
+from consistency.referee.system import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from matplotlib.figure import Figure as Drawing
 
-    from consistency.referee.system.progress import Advance
+    from consistency.referee.system import Advance
 
 REPORT_FILES = ("report.html", "report.pdf", "verdict.json")
 MARK = "<!-- written by consistency analyse, which replaces it -->\n"  # the end of a file of a verdict
@@ -58,7 +58,7 @@ def write_file_pages(
     records: Sequence[Record], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
-    from consistency.referee.system.folders import manifest_of
+    from consistency.referee.system import manifest_of
 
     write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
@@ -85,7 +85,7 @@ def write_file_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.system.folders import manifest_of, write_folder
+    from consistency.referee.system import manifest_of, write_folder
 
     manifest = manifest_of(kind="verdict", source=title)
     document = compose_files(records, judged, title, manifest)
@@ -106,7 +106,7 @@ def write_text_file(document: Document, path: Path) -> Path:
     InputError
         The file cannot be written.
     """
-    from consistency.referee.system.folders import command_line
+    from consistency.referee.system import command_line
 
     write_file(path, f"{rendered(replace(document, command=command_line()), path)}{MARK}".encode())
     return path
@@ -121,7 +121,7 @@ def require_report(report: Path, overwrite: bool) -> bool:
         Something other than a report of a verdict is there, without ``overwrite``; the name is of a page or of JSON,
         which a folder has; or the system refuses.
     """
-    from consistency.referee.system.folders import require_free
+    from consistency.referee.system import require_free
 
     if report.suffix.lower() in (".html", ".pdf", ".json") and not report.is_dir():
         raise InputError(
@@ -143,7 +143,7 @@ def is_one_file(report: Path) -> bool:
 
 def is_own_report(path: Path) -> bool:
     """Whether a folder or a file was written by ``analyse --report``, so that the next one replaces it."""
-    from consistency.referee.system.folders import read_manifest
+    from consistency.referee.system import read_manifest
 
     try:
         if path.is_dir():

@@ -23,8 +23,7 @@ from pathlib import Path
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, require_name
 from consistency.referee.readers.pipeline.program_runs import LOG, RUN_FILE, RUN_KIND, ProgramRun, filled
-from consistency.referee.system.progress import say
-from consistency.referee.system.stopping import AT_STOP, FULL
+from consistency.referee.system import AT_STOP, FULL, say
 
 LARGEST_SEED = 2**31 - 1  # fits an int and std::stoi
 HALF = 2**16
@@ -72,7 +71,8 @@ class Program:
         """Digest of every file that a word names."""
         found = {}
         for word in self.words:
-            for path in self._paths(word):
+            for name in {word, word.rpartition("=")[2]}:  # by itself or behind an equals sign
+                path = (self.cwd or self.here) / filled(name, {"here": str(self.here)})
                 if path.is_file():
                     found[str(path)] = _digest(path)
         return found
@@ -83,12 +83,6 @@ class Program:
             name = word.rpartition("=")[2]
             if not Path(name).is_absolute() and (Path(name).suffix or os.sep in name) and _is_there(self.here / name):
                 say(f"consistency: {name} is not seen from the run's folder; write {{here}}/{name}")
-
-    def _paths(self, word: str) -> Iterator[Path]:
-        """Files that a word may name, by itself or behind an equals sign."""
-        for name in {word, word.rpartition("=")[2]}:
-            path = Path(filled(name, {"here": str(self.here)}))
-            yield (self.cwd or self.here) / path
 
 
 def program_of(words: Sequence[str], here: Path, cwd: Path | None = None, hint: str = "") -> Program:

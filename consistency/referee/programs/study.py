@@ -59,11 +59,10 @@ from consistency.referee.readers.pipeline.read_files import (
     records_of_found,
 )
 from consistency.referee.readers.truth_matching import Estimator
-from consistency.referee.system.folders import IN_PYTHON, manifest_of, writing
-from consistency.referee.system.progress import Advance, progress, say
-from consistency.referee.system.stopping import PARTIAL, write_whole
+from consistency.referee.system import IN_PYTHON, PARTIAL, Advance, manifest_of, progress, say, write_whole, writing
 from consistency.referee.verdicts.judge_sources import settings_of, skip_asked
 
+FOR_STUDY = ("each", "cwd", "skip", "resume", "overwrite")  # options beside those of the plan and of files
 FOR_PLAN = ("until_decided", "max_runs", "seed", "jobs", "timeout", "check_seed", "keep", "optimal_gain")
 ALIKE = 3  # first runs that failed alike stop a study
 HOPELESS = 20  # and so many that failed in any way
@@ -150,7 +149,7 @@ def monte_carlo(
         "until_decided": until_decided, "max_runs": max_runs, "seed": seed, "jobs": jobs, "timeout": timeout,
         "check_seed": check_seed, "keep": keep, "optimal_gain": optimal_gain,
     }  # fmt: skip
-    records, verdicts = _run(argv, settings, runs, estimates, truth, out, **options, **reading)
+    records, verdicts = _run(argv, settings, runs, estimates, truth, out, options | reading)
     record = _chosen(records, filter)
     return verdicts[record.name]
 
@@ -163,10 +162,10 @@ def record_of_program(
     truth: str | Path | None,
     out: str | Path | None,
     filter: str | None,
-    **options: Any,
+    options: Mapping[str, Any],
 ) -> Record:
     """Record of the runs of a program, whose number follows from the settings; as :func:`monte_carlo`."""
-    records, _ = _run(argv, settings, runs, estimates, truth, out, **options)
+    records, _ = _run(argv, settings, runs, estimates, truth, out, options)
     return _chosen(records, filter)
 
 
@@ -177,33 +176,31 @@ def _run(
     estimates: str,
     truth: str | Path | None,
     out: str | Path | None,
-    *,
-    each: str | None = None,
-    cwd: str | Path | None = None,
-    skip: str | float | None = None,
-    resume: bool = False,
-    overwrite: bool = False,
-    **options: Any,
+    options: Mapping[str, Any],
 ) -> tuple[list[Record], dict[str, Verdict]]:
     here = Path.cwd()
-    of_plan = {name: options.pop(name) for name in FOR_PLAN if name in options}
-    for name in options:
-        if name not in VALUES:
+    of_plan = {name: value for name, value in options.items() if name in FOR_PLAN}
+    of_files: dict[str, Any] = {}
+    for name, value in options.items():
+        if name in VALUES:
+            of_files[name] = value
+        elif name not in (*FOR_PLAN, *FOR_STUDY):
             raise TypeError(f"monte_carlo: unknown option '{name}'")
-    options["truth"] = truth
+    of_files["truth"] = truth
     for name in PATHS:
-        if options.get(name) is not None:
-            options[name] = Path(options[name])
+        if of_files.get(name) is not None:
+            of_files[name] = Path(of_files[name])
+    each, cwd, skip, resume, overwrite = map(options.get, FOR_STUDY)
     if cwd is not None:
         cwd = Path(cwd)
     program = program_of(argv, here, cwd)
     inputs = () if each is None else inputs_of(each, here)
     plan = ProgramPlan(runs, inputs=inputs, settings=settings, skip=skip_asked(skip), **of_plan)
-    reading = make_reading(**options)
+    reading = make_reading(**of_files)
     if out is not None:
-        return run_study(program, plan, Path(out), estimates, reading, resume, overwrite)
+        return run_study(program, plan, Path(out), estimates, reading, bool(resume), bool(overwrite))
     with tempfile.TemporaryDirectory(prefix="consistency-") as folder:
-        return run_study(program, plan, Path(folder) / "runs", estimates, reading, resume, overwrite)
+        return run_study(program, plan, Path(folder) / "runs", estimates, reading, bool(resume), bool(overwrite))
 
 
 def _chosen(records: Sequence[Record], name: str | None) -> Record:
@@ -400,7 +397,7 @@ class _Loop:
                 self._check_seed(stack)
             run = next(missing)
             while not self._is_decided:
-                while len(pending) < self._at_once(workers) and not self._is_enough(run):
+                while len(pending) < self._at_once(workers) and (self.total is None or run < self.total):
                     pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
                     run = next(missing)
                 if not pending:
@@ -415,9 +412,6 @@ class _Loop:
     def _at_once(self, workers: int) -> int:
         """Runs at a time: few until the first ones have shown that the program works."""
         return workers if len(self.runs.found) >= PROOF else min(workers, PROOF)
-
-    def _is_enough(self, run: int) -> bool:
-        return self.total is not None and run >= self.total
 
     @property
     def _is_decided(self) -> bool:

@@ -85,7 +85,6 @@ class Track:
     covariance: Array | None = None  # (k, n, n)
     nis: Array | None = None  # (k,)
     nis_dof: Array | None = None  # (k,)
-    nees: Array | None = None  # (k,)
     t: Array | None = None  # (k,), s; of windows, of their beginnings
     truth_covariance: Array | None = None  # (k, n, n), of the truth itself; NaN where it has none
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
@@ -191,19 +190,19 @@ def assemble(
     )
 
 
-def _on_steps(tracks: Sequence[Track], steps: int) -> dict[str, Any]:
-    """Arrays of tracks over (runs, steps), NaN where a run has no row."""
+def _on_steps(tracks: Sequence[Mapping[str, Any]], steps: int) -> dict[str, Any]:
+    """Arrays of tracks by name, (k, ...) each, over (runs, steps), NaN where a run has no row."""
     arrays: dict[str, Any] = {}
     for key in (*ARRAYS, "nees", "t"):
         arrays[key] = None
         for row, track in enumerate(tracks):
-            values = getattr(track, key)
+            values = track.get(key)
             if values is None:
                 continue
             if arrays[key] is None:
                 shape = (len(tracks), steps, *values.shape[1:])
                 arrays[key] = np.full(shape, np.nan)
-            arrays[key][row, track.column] = values
+            arrays[key][row, track["column"]] = values
     return arrays
 
 
@@ -337,22 +336,20 @@ def _reason(error_ok: bool, kind: int, what: str = "estimate") -> str:
     return "covariance is not finite" if kind == Validity.NOT_FINITE else INDEFINITE
 
 
-def _cut(track: Track, counted: Array) -> Track:
-    """As many rows as ``counted`` (k,) has, with the NEES of those that count."""
+def _cut(track: Track, counted: Array) -> dict[str, Any]:
+    """Arrays by name of as many rows as ``counted`` (k,) has, with the NEES of those that count."""
     end = len(counted)
     arrays: dict[str, Any] = {}
     for key in ("column", "t", *ARRAYS):
         arrays[key] = at(getattr(track, key), slice(end))
-    track = replace(track, place=track.place.at(slice(end)), **arrays)
-    error = track.error
-    P = track.covariance
+    error, P = arrays["error"], arrays["covariance"]
     if error is None or P is None:
-        return track
+        return arrays
     values = np.full(end, np.nan)
     values[counted] = nees(error[counted], P[counted])
     if not counted.all():
         P = np.where(counted[:, None, None], P, np.nan)
-    return replace(track, covariance=P, nees=values)
+    return {**arrays, "covariance": P, "nees": values}
 
 
 def not_estimated(errors: Sequence[Array], variances: Sequence[Array]) -> Indices:

@@ -1,4 +1,4 @@
-"""Renderers of a document, one in a file; they know the tree of ``document`` and nothing else.
+"""Renderers of a document, one in a file; they know its tree of plain data (``blocks``) and nothing else.
 
 A renderer whose whole output is the text of a file is a module ``as_SUFFIX`` with ``render(document)``, in no list.
 """
@@ -11,7 +11,7 @@ from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from consistency.referee.document.blocks import Document
+    from consistency.referee.show.blocks import Document
 
 # suffix of a file -> module of its renderer
 FORMATS = {f".{name[3:]}": f"{__name__}.{name}" for _, name, _ in iter_modules(__path__) if name[:3] == "as_"}

@@ -9,7 +9,7 @@ from html import escape
 from itertools import groupby
 from pathlib import Path
 
-from consistency.referee.document.blocks import (
+from consistency.referee.show.blocks import (
     Answer,
     Block,
     Bullets,

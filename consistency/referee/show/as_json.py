@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from consistency.referee.diagnostics.verdict import plain
-from consistency.referee.document.blocks import Document
+from consistency.referee.show.blocks import Document
 
 
 def render(document: Document) -> str:

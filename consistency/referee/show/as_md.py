@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from consistency.referee.diagnostics.number_words import with_subject
-from consistency.referee.document.blocks import (
+from consistency.referee.show.blocks import (
     PLAIN,
     Block,
     Bullets,

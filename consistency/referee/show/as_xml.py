@@ -6,7 +6,7 @@ import re
 from xml.sax.saxutils import escape, quoteattr
 
 from consistency.referee.diagnostics.number_words import with_subject
-from consistency.referee.document.blocks import Document, Reason
+from consistency.referee.show.blocks import Document, Reason
 
 FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # XML 1.0, section 2.2
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.referee.document.blocks import BAND, Document, Look
+from consistency.referee.show.blocks import BAND, Document, Look
 from consistency.referee.types import Array, Indices
 
 if TYPE_CHECKING:

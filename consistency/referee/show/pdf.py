@@ -14,10 +14,10 @@ from typing import Any
 import matplotlib as mpl
 import typst
 
-from consistency.referee.document import blocks
-from consistency.referee.document.blocks import unbroken, written
+from consistency.referee.show import blocks
+from consistency.referee.show.blocks import unbroken, written
 from consistency.referee.show.figures import Pictures, paint
-from consistency.referee.system.stopping import AT_STOP, remove_at_stop
+from consistency.referee.system import AT_STOP, remove_at_stop
 
 TEMPLATE = "report.typ"
 FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"  # those of the figures, whose text stays text

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from consistency.referee.document.blocks import PLAIN, Block, Cell, Reasons, Status, Table, fragment, written
+from consistency.referee.show.blocks import PLAIN, Block, Cell, Reasons, Status, Table, fragment, written
 
 COLOURS = {
     "consistent": "green", "overconfident": "red", "conservative": "yellow", "biased": "red", "heavy-tailed": "red",

@@ -19,14 +19,13 @@ from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, RunSummary, compare, summary
 from consistency.referee.diagnostics.record import Record, Skip, numbered_axes
 from consistency.referee.diagnostics.verdict import plain
-from consistency.referee.document.blocks import Block, Document, Text
-from consistency.referee.document.tables import comparison_table
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
-from consistency.referee.system.folders import SCHEMA_VERSION, manifest_of, writing
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.show.blocks import Block, Document, Text
+from consistency.referee.system import SCHEMA_VERSION, manifest_of, write_whole, writing
 from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
+from consistency.referee.verdicts.tables import comparison_table
 
 HIGHEST_DOF = 1000  # of an error in a baseline
 FILTER_KEYS = ("runs", "dof", "nees", "squared", "covered", "failures")

@@ -21,7 +21,6 @@ from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.number_words import percent, plural, short
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.whitening import ROUNDED, Validity, classify
-from consistency.referee.document.blocks import Block, Bullets, Document, Facts, Text, fragment
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats import file_kinds, flight_logs
 from consistency.referee.readers.formats.columns import (
@@ -39,6 +38,7 @@ from consistency.referee.readers.pipeline import read_files
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.runs_to_record import not_estimated
 from consistency.referee.readers.truth_matching import WHOLE, Estimator, submatrices
+from consistency.referee.show.blocks import Block, Bullets, Document, Facts, Text, fragment
 from consistency.referee.types import Array
 from consistency.referee.verdicts.compare_sources import is_baseline
 from consistency.referee.verdicts.monitor_sources import read_innovations

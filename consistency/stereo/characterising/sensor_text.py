@@ -17,10 +17,9 @@ from consistency.bench.store.recorded_log import sensor_keys
 from consistency.referee.diagnostics.number_words import p_text
 from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import Block, Cell, Column, Quantity, Table, Text, table
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import writing
-from consistency.referee.system.stopping import write_whole
+from consistency.referee.show.blocks import Block, Cell, Column, Quantity, Table, Text, table
+from consistency.referee.system import write_whole, writing
 from consistency.stereo.characterising.characterise import NAMES, BiasEstimate, Characterisation, Coordinate
 
 GAUSSIAN = 1e-3  # p-value of normality below which a distribution is called other than Gaussian

@@ -25,7 +25,7 @@ from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import manifest_of, require_free
+from consistency.referee.system import manifest_of, require_free
 from consistency.referee.types import Array, Indices
 from consistency.stereo.frontend.camera_truth import find_truth, missing_of_drive, read_truth
 from consistency.stereo.visual_odometry.arrays import opencv

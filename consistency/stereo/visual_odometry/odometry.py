@@ -19,7 +19,7 @@ from consistency.referee.diagnostics import uncertain_truth
 from consistency.referee.diagnostics.uncertain_truth import SharedError
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import propagated
-from consistency.referee.system.progress import progress
+from consistency.referee.system import progress
 from consistency.referee.types import Array, Indices
 from consistency.stereo.visual_odometry.maximum_likelihood import refine_reprojection
 from consistency.stereo.visual_odometry.relative_motion import (

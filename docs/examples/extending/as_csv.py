@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 
-from consistency.referee.document.blocks import PLAIN, Document, Table, written
+from consistency.referee.show.blocks import PLAIN, Document, Table, written
 
 
 def render(document: Document) -> str:

@@ -1,7 +1,7 @@
 import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
-from consistency.referee.document.blocks import Figure
+from consistency.referee.show.blocks import Figure
 from consistency.referee.show.figures import add_legend, canvas, curve
 from consistency.referee.types import Array
 

@@ -23,7 +23,7 @@ from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.run_outcome import Recorded, RunOutcome, Simulated, TrialWork
 from consistency.bench.runs.workers import BatchResult, ExecutorWorkers, LocalThreads, do_batch, failed
 from consistency.bench.store.results import open_results
-from consistency.referee.system.folders import this_machine
+from consistency.referee.system import this_machine
 from consistency.types import Failure
 
 RUNS = 40

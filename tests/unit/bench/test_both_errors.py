@@ -18,11 +18,11 @@ from consistency.diagnostics import Interval, Settings, judge, map_score, sequen
 from consistency.referee.column_names import OWN_COVARIANCE
 from consistency.referee.diagnostics.scale import ratio_interval
 from consistency.referee.diagnostics.verdict import MapScore
-from consistency.referee.document.tables import document, map_text
 from consistency.referee.gating.checked_input import record_of_filter
 from consistency.referee.show.terminal import show
 from consistency.referee.types import Failure
 from consistency.referee.verdicts.compare_sources import baseline
+from consistency.referee.verdicts.tables import document, map_text
 
 RUNS = 24
 KEYS = ["run", "step", "t", "x", "y", "heading"]

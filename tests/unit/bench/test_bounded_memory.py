@@ -18,8 +18,8 @@ from consistency.bench.store.results import open_results
 from consistency.diagnostics import Settings, judge, make_record, summary
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.whitening import all_finite, squared_length
-from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
+from consistency.referee.verdicts.tables import document
 
 STEPS = 200
 RUNS = 4000

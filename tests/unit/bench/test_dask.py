@@ -15,7 +15,7 @@ from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.run_outcome import Simulated, TrialWork
 from consistency.bench.runs.workers import ExecutorWorkers, LocalThreads
-from consistency.referee.system.folders import this_machine
+from consistency.referee.system import this_machine
 
 pytestmark = [
     pytest.mark.skipif(os.name == "nt", reason="signals"),

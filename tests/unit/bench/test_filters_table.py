@@ -10,7 +10,7 @@ import pytest
 import consistency as cs
 from consistency.bench.pages.sections.filters_table import filters_table
 from consistency.bench.runs.reproduce_findings import Study, experiments
-from consistency.referee.document.blocks import Status
+from consistency.referee.show.blocks import Status
 
 ROW = {
     "filter": "a", "realisable": "yes", "error": "so2", "status": "consistent",

@@ -16,8 +16,8 @@ from consistency.bench.runs import reproduce_findings
 from consistency.bench.runs import reproduce_findings as module
 from consistency.bench.runs.reproduce_findings import Study, reproduce
 from consistency.commands.studies import reproduce_command
-from consistency.referee.document.blocks import Heading
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.show.blocks import Heading
+from consistency.referee.system import read_manifest
 
 SCRIPT = '''"""A question."""
 import os
@@ -184,7 +184,7 @@ def test_a_finding_of_none_is_not_shown():
 
 def test_scripts_are_said_as_they_begin(scripts, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(module, "WAITING", 0.2)
-    said = "import time; from consistency.referee.system.progress import say; say('inside'); time.sleep(1)"
+    said = "import time; from consistency.referee.system import say; say('inside'); time.sleep(1)"
     write(scripts, 2, ("two",), "OWN_PROCESS = True", said)
     reproduce(["one", "two"], 5, 0, 2, tmp_path / "out")
     lines = capfd.readouterr().err.splitlines()

@@ -25,8 +25,8 @@ from consistency.bench.runs.run_outcome import RunOutcome, TrialWork, outcome_of
 from consistency.bench.simulation import World
 from consistency.bench.store import parquet
 from consistency.bench.store.results import StoredResults, open_results
-from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
+from consistency.referee.verdicts.tables import document
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 FILTERS = ["ekf-uvd", "ekf-xyz"]

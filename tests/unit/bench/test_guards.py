@@ -25,9 +25,9 @@ from consistency.bench.store.results import open_results
 from consistency.bench.types import Info, Observation
 from consistency.commands.app import app
 from consistency.diagnostics import clustered_share, rejection_score
-from consistency.referee.document.blocks import Name, Table, brief, written
-from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
+from consistency.referee.show.blocks import Name, Table, brief, written
+from consistency.referee.verdicts.tables import document
 
 WRONG = [{"kind": "wrong-match", "rate": 0.05}]
 

@@ -23,8 +23,8 @@ from consistency.bench.simulation import World
 from consistency.bench.store import journal as journals
 from consistency.bench.store.journal import DATABASE, Journal, Unfinished
 from consistency.bench.store.results import open_results
-from consistency.referee.system import folders
-from consistency.referee.system.progress import progress, say
+from consistency.referee import system
+from consistency.referee.system import progress, say
 
 FILTER = ["ekf-uvd"]
 RUNS = 6
@@ -320,7 +320,7 @@ def test_killed_while_results_were_replaced(run, whole, tmp_path, monkeypatch):
             raise SystemExit("killed")
         replace(source, target)
 
-    monkeypatch.setattr(folders.os, "replace", dies)
+    monkeypatch.setattr(system.os, "replace", dies)
     with pytest.raises(SystemExit):
         run(out=out, resume=True)
     monkeypatch.undo()

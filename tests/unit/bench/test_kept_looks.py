@@ -17,8 +17,8 @@ from consistency.bench.store.recorded_log import read_log
 from consistency.bench.store.results import open_results
 from consistency.diagnostics import Record
 from consistency.referee.diagnostics import judge_record
-from consistency.referee.document.tables import document
 from consistency.referee.show.as_json import render
+from consistency.referee.verdicts.tables import document
 
 OPEN = {"detect": 1.05, "false_alarm": 1e-6, "max_runs": 20, "seed": 3, "jobs": 1}  # looks at 12 to 20
 

@@ -14,7 +14,7 @@ import consistency as cs
 from consistency.bench.models.observation import project
 from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.bench.types import Trial
-from consistency.referee.system.folders import manifest_of
+from consistency.referee.system import manifest_of
 
 ROOT = Path(__file__).parents[3]
 KITTI = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # right, down, forward <- forward, left, up

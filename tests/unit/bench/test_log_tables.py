@@ -8,7 +8,7 @@ from consistency.bench.runs.montecarlo import simulate_log
 from consistency.bench.store.recorded_log import read_log
 from consistency.commands import main
 from consistency.referee.errors import InputError
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.system import read_manifest
 from consistency.stereo.characterising.sources import is_log
 
 NAMES = ("controls", "observations", "truth", "landmarks")

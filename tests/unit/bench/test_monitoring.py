@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
 from consistency.bench.runs.results_to_records import innovations_of
-from consistency.referee.document.alarms import monitor_document
 from consistency.referee.errors import InputError
 from consistency.referee.pages.record_figures import POINTS, averaged, monitor_drawing
 from consistency.referee.pages.write_pages import plotted, require_plot
@@ -22,7 +21,13 @@ from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show.as_json import render
 from consistency.referee.show.figures import drawn, saved, svg
 from consistency.referee.show.terminal import show
-from consistency.referee.verdicts.monitor_sources import make_monitor, read_innovations, watch, watch_lines
+from consistency.referee.verdicts.monitor_sources import (
+    make_monitor,
+    monitor_document,
+    read_innovations,
+    watch,
+    watch_lines,
+)
 
 NIS = [1.0, 2.5, math.nan, 0.25, 7.0]
 DOF = [2, 2, 0, 1, 3]

@@ -12,9 +12,9 @@ import consistency as cs
 from consistency.bench.pages.results_report import answer, build_report, compose
 from consistency.bench.pages.sections import several_studies
 from consistency.bench.pages.sections.report_input import STEREO
-from consistency.referee.document.blocks import Figure, Name, Status, Table, written
 from consistency.referee.show import pdf
 from consistency.referee.show.as_html import render
+from consistency.referee.show.blocks import Figure, Name, Status, Table, written
 
 FILTERS = ("ekf-uvd", "ekf-xyz")
 

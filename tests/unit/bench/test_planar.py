@@ -24,7 +24,7 @@ from consistency.bench.runs.run_outcome import is_flat
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.diagnostics import map_score
-from consistency.referee.system.folders import manifest_of
+from consistency.referee.system import manifest_of
 
 STEP = 1e-6
 POINTS = np.array([[2.0, 0.5], [-1.5, 0.8], [-1.2, -2.0], [0.3, -0.4]])

@@ -39,13 +39,13 @@ from consistency.diagnostics import Answer, Interval, Settings, judge, make_reco
 from consistency.referee.column_names import COVARIANCE
 from consistency.referee.diagnostics.number_words import short
 from consistency.referee.diagnostics.verdict_parts import DIRECTION, STATUSES, STEP
-from consistency.referee.document.blocks import Figure, written
-from consistency.referee.document.tables import FURTHER, page, shown_inside
 from consistency.referee.pages import ratio_figures, verdicts
 from consistency.referee.pages import verdicts as questions_table
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.show import as_html, pdf
+from consistency.referee.show.blocks import Figure, written
 from consistency.referee.types import Failure
+from consistency.referee.verdicts.tables import FURTHER, page, shown_inside
 
 front_end, stereo_noise = figures("front_end"), figures("stereo_noise")
 ODD = {

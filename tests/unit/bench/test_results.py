@@ -17,7 +17,7 @@ from consistency.bench.runs.results_to_records import record_of
 from consistency.bench.store.parquet import check_column
 from consistency.bench.types import Gaussian
 from consistency.referee.column_names import COLUMNS
-from consistency.referee.system.folders import require_free
+from consistency.referee.system import require_free
 
 TABLES = ("estimates", "failures", "truth", "landmarks", "map")
 

@@ -20,7 +20,7 @@ import consistency as cs
 from consistency.bench.store.parquet import read_parquet
 from consistency.bench.sweeps.sweep_file import load_sweep
 from consistency.referee.parsing import one_line, read_json, read_text, read_toml, reading, require_room
-from consistency.referee.system.folders import data_folder
+from consistency.referee.system import data_folder
 from consistency.referee.verdicts.compare_sources import read_baseline
 
 

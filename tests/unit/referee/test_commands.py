@@ -29,7 +29,7 @@ from consistency.referee.extras import (
     require,
     requirements,
 )
-from consistency.referee.system.folders import summaries
+from consistency.referee.system import summaries
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

@@ -12,7 +12,8 @@ from consistency.diagnostics import Comparison, Interval, MapScore, judge, make_
 from consistency.referee.diagnostics.comparison import Difference
 from consistency.referee.diagnostics.sentences import reasons
 from consistency.referee.diagnostics.verdict_parts import ABOUT, ALONE, JointScore, RejectionScore
-from consistency.referee.document.blocks import (
+from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
+from consistency.referee.show.blocks import (
     PLAIN,
     PRINTED,
     Answer,
@@ -35,7 +36,7 @@ from consistency.referee.document.blocks import (
     unbroken,
     written,
 )
-from consistency.referee.document.tables import (
+from consistency.referee.verdicts.tables import (
     FURTHER,
     MAP_COLUMNS,
     TERMINAL,
@@ -51,7 +52,6 @@ from consistency.referee.document.tables import (
     rejection_cells,
     rejection_text,
 )
-from consistency.referee.show import FORMATS, as_html, as_json, as_md, as_xml, rendered, terminal
 
 INF, NAN = float("inf"), float("nan")
 GOOD = Reason("ekf", "consistent: no fault found", ("mean NEES 3.0",))

@@ -13,10 +13,19 @@ import traceback
 
 import pytest
 
+from consistency.referee import system
 from consistency.referee.errors import InputError
-from consistency.referee.system import stopping
-from consistency.referee.system.folders import NewFolder, read_manifest, require_free, unfinished_of, write_folder
-from consistency.referee.system.stopping import away_from_signals, end_with_parent, link_to_parent, write_whole
+from consistency.referee.system import (
+    NewFolder,
+    away_from_signals,
+    end_with_parent,
+    link_to_parent,
+    read_manifest,
+    require_free,
+    unfinished_of,
+    write_folder,
+    write_whole,
+)
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="fork")
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -165,17 +174,17 @@ def test_ctrl_c_comes_after_the_call():
 
 WORKER = """
 import multiprocessing, os, sys, time
-from consistency.referee.system import stopping
-stopping.IS_LINUX = stopping.IS_LINUX and {prctl}
+from consistency.referee import system
+system.IS_LINUX = system.IS_LINUX and {prctl}
 
 def work(*link):
-    stopping.end_with_parent(*link)
+    system.end_with_parent(*link)
     print('there', flush=True)
     time.sleep(60)
 
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
-    context.Process(target=work, args=stopping.link_to_parent(context)).start()
+    context.Process(target=work, args=system.link_to_parent(context)).start()
     time.sleep(60)
 """
 
@@ -193,7 +202,7 @@ def test_a_worker_ends_with_its_parent(prctl, tmp_path):
         assert process.stdout.read() == ""
 
 
-@pytest.mark.skipif(not stopping.IS_LINUX, reason="prctl")
+@pytest.mark.skipif(not system.IS_LINUX, reason="prctl")
 def test_a_worker_whose_parent_has_ended_before_ends():
     child = os.fork()
     if child == 0:

@@ -16,10 +16,10 @@ from consistency.diagnostics import Settings, judge, make_record
 from consistency.referee.diagnostics.number_words import UNCERTAIN, off_by, ratio_text, short
 from consistency.referee.diagnostics.sentences import reasons
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import PLAIN, Quantity, written
-from consistency.referee.document.tables import TERMINAL, cells, document
 from consistency.referee.pages.write_pages import compose_files
+from consistency.referee.show.blocks import PLAIN, Quantity, written
 from consistency.referee.types import Failure
+from consistency.referee.verdicts.tables import TERMINAL, cells, document
 
 
 def judged(error, **settings):

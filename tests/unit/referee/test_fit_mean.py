@@ -11,31 +11,29 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.fit_covariance import systematic_errors as errors_
-from consistency.referee.fit_covariance.motion_windows import cut_windows, span_of
-from consistency.referee.fit_covariance.noise_model import correction, data_of_model, noise_lines
-from consistency.referee.fit_covariance.systematic_errors import (
+from consistency.referee.fit_covariance import mean_and_noise as errors_
+from consistency.referee.fit_covariance.drives import cut_windows, span_of
+from consistency.referee.fit_covariance.mean_and_noise import (
     BACKWARD,
     FORWARD,
     GAP,
     NEIGHBOURS,
     Mean,
     MeanFit,
+    WhiteNoise,
     choose_mean,
+    constant_of,
     estimate,
+    fit_noise,
+    fitted_terms,
     jacobian_of_mean,
+    jitter_of,
     no_mean,
     normal_equations,
     sum_of_neighbours,
-)
-from consistency.referee.fit_covariance.white_noise import (
-    WhiteNoise,
-    constant_of,
-    fit_noise,
-    fitted_terms,
-    jitter_of,
     terms_of,
 )
+from consistency.referee.fit_covariance.noise_model import correction, data_of_model, noise_lines
 
 FIT = MeanFit(
     Mean(1.0, 0.95, (0.0,)), Mean(1.01, 0.94, (0.001,)), np.array([0.98, 0.9, -0.01]), np.array([1.03, 0.98, 0.012]),

@@ -16,16 +16,30 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import Ratio, folds_of, ratio_of
-from consistency.referee.fit_covariance.drives import Drive, drive_of
-from consistency.referee.fit_covariance.estimation import interval_of, nees_of
-from consistency.referee.fit_covariance.motion_windows import (
+from consistency.referee.fit_covariance.drives import (
+    Drive,
     cut_windows,
+    drive_of,
     in_plane,
     jackknife_blocks,
     span_of,
     vectors_of,
 )
-from consistency.referee.fit_covariance.motion_windows import motion_matrices as pieces_of
+from consistency.referee.fit_covariance.drives import motion_matrices as pieces_of
+from consistency.referee.fit_covariance.estimation import interval_of, nees_of
+from consistency.referee.fit_covariance.mean_and_noise import (
+    FORWARD,
+    Mean,
+    carriers,
+    estimate,
+    fit_mean,
+    fit_noise,
+    fit_terms,
+    jacobian_of_mean,
+    jitter_of,
+    normal_equations,
+    terms_of,
+)
 from consistency.referee.fit_covariance.noise_model import caution, model_sentence, noise_lines
 from consistency.referee.fit_covariance.refusals import (
     TERMS,
@@ -34,21 +48,6 @@ from consistency.referee.fit_covariance.refusals import (
     body_turn,
     rotation_growth,
     variance_between,
-)
-from consistency.referee.fit_covariance.systematic_errors import (
-    FORWARD,
-    Mean,
-    carriers,
-    estimate,
-    fit_mean,
-    jacobian_of_mean,
-    normal_equations,
-)
-from consistency.referee.fit_covariance.white_noise import (
-    fit_noise,
-    fit_terms,
-    jitter_of,
-    terms_of,
 )
 from consistency.referee.geometry import composed, inverse, log, vectors
 

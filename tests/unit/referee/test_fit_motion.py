@@ -12,19 +12,20 @@ from scipy import stats
 import consistency as cs
 from consistency.referee.errors import InputError
 from consistency.referee.fit_covariance.covariance_ratios import JudgedSpan, Ratio, ratio_of
-from consistency.referee.fit_covariance.drives import Drive, clock_offset, drive_of
-from consistency.referee.fit_covariance.fit_files import snippets
-from consistency.referee.fit_covariance.motion_windows import (
+from consistency.referee.fit_covariance.drives import (
     ROUNDED,
+    Drive,
     angles,
+    clock_offset,
     cut_windows,
+    drive_of,
     span_of,
     ways,
 )
+from consistency.referee.fit_covariance.fit_files import snippets
+from consistency.referee.fit_covariance.mean_and_noise import Mean, fit_noise, fit_slip, jacobian, jacobian_of_mean
 from consistency.referee.fit_covariance.noise_model import correction, decided, model_sentence, noise_lines
 from consistency.referee.fit_covariance.refusals import TERMS, mean_by_motion, p_value_of, require_poses, values_by_bin
-from consistency.referee.fit_covariance.systematic_errors import Mean, fit_slip, jacobian, jacobian_of_mean
-from consistency.referee.fit_covariance.white_noise import fit_noise
 from consistency.referee.geometry import composed, inverse, vectors
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.places import Places

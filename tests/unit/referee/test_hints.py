@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from consistency.diagnostics import make_record
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import composed, matrices, planar_error, spatial_error, vectors, wrap
-from consistency.referee.notebook.read_and_judge import judge, read
+from consistency.referee.notebook import judge, read
 from consistency.referee.readers.alignment import (
     BodyTransform,
     WorldTransform,

@@ -9,8 +9,8 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_array_equal
 from painted import legend_of, places, shaded
 
-from consistency.referee.document.blocks import EXPECTED, LIMIT, Document, Figure, Look, style
 from consistency.referee.show import as_html
+from consistency.referee.show.blocks import EXPECTED, LIMIT, Document, Figure, Look, style
 from consistency.referee.show.figures import LIMIT as MOST
 from consistency.referee.show.figures import (
     MOST_TITLES,

@@ -2,8 +2,8 @@
 
 import pytest
 
-from consistency.referee.system import progress as module
-from consistency.referee.system.progress import announce, each, progress, quiet, say, with_progress
+from consistency.referee import system as module
+from consistency.referee.system import announce, each, progress, quiet, say, with_progress
 
 
 def test_what_is_announced_is_said_where_all_else_is_quiet(capsys):

@@ -14,7 +14,7 @@ from records import changed
 
 import consistency as cs
 from consistency.diagnostics import make_record
-from consistency.referee.notebook import read_and_judge
+from consistency.referee import notebook
 from consistency.referee.readers.options import MAX_DT, OPTIONS, Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline.read_files import own_names
 from consistency.testing import assert_consistent
@@ -28,7 +28,7 @@ def test_python_has_every_option_of_files():
 def test_each_option_of_python_reaches_the_readers_under_its_name(monkeypatch):
     given = {each.name: f"the {each.name}" for each in OPTIONS}
     seen = []
-    monkeypatch.setattr(read_and_judge, "read_recordings", lambda path, reading: [seen.append(reading)])
+    monkeypatch.setattr(notebook, "read_recordings", lambda path, reading: [seen.append(reading)])
     with pytest.raises(AttributeError):  # of a record that is None
         cs.read("est.csv", **given)
     assert {name: str(value) for name, value in seen[0].as_options().items()} == given

@@ -10,9 +10,9 @@ from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections import anees
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_error_table
-from consistency.referee.document.blocks import Name, Quantity, Status, Table, brief, written
-from consistency.referee.document.tables import page
 from consistency.referee.pages import verdicts
+from consistency.referee.show.blocks import Name, Quantity, Status, Table, brief, written
+from consistency.referee.verdicts.tables import page
 
 
 @pytest.fixture(scope="module")

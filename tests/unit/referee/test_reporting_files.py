@@ -16,11 +16,11 @@ from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.document.blocks import Details, Figure, Status, Table, Text
 from consistency.referee.pages.record_figures import observed_coverage, record_figures, shown_run, unit_of
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.pages.write_pages import compose_files
 from consistency.referee.show import as_html
+from consistency.referee.show.blocks import Details, Figure, Status, Table, Text
 from consistency.referee.verdicts.judge_sources import judge_all
 
 RUNS, STEPS = 30, 25

@@ -11,7 +11,13 @@ from numpy.testing import assert_allclose
 import consistency as cs
 from consistency.diagnostics import make_record
 from consistency.referee.diagnostics.monitor import GateRatios
-from consistency.referee.document.blocks import (
+from consistency.referee.pages.ratio_figures import bound_figures
+from consistency.referee.pages.record_figures import monitor_drawing, record_figures
+from consistency.referee.pages.verdicts import time_axis_of
+from consistency.referee.pages.write_pages import compose_files
+from consistency.referee.readers.formats.innovation_files import NisLog
+from consistency.referee.show import as_html
+from consistency.referee.show.blocks import (
     COLOURS,
     OVER,
     RIGHT,
@@ -25,12 +31,6 @@ from consistency.referee.document.blocks import (
     Text,
     badges,
 )
-from consistency.referee.pages.ratio_figures import bound_figures
-from consistency.referee.pages.record_figures import monitor_drawing, record_figures
-from consistency.referee.pages.verdicts import time_axis_of
-from consistency.referee.pages.write_pages import compose_files
-from consistency.referee.readers.formats.innovation_files import NisLog
-from consistency.referee.show import as_html
 from consistency.referee.show.figures import canvas, drawn
 from consistency.referee.verdicts.monitor_sources import make_monitor, watch
 

@@ -17,9 +17,9 @@ from consistency.referee.diagnostics.fault_words import bias_text, scale_text, s
 from consistency.referee.diagnostics.number_words import ratio_text, short
 from consistency.referee.diagnostics.sentences import reasons
 from consistency.referee.diagnostics.verdict_parts import Interval
-from consistency.referee.document.blocks import Quantity
-from consistency.referee.document.tables import TERMINAL, document, rows
+from consistency.referee.show.blocks import Quantity
 from consistency.referee.show.terminal import show
+from consistency.referee.verdicts.tables import TERMINAL, document, rows
 
 SURE = 1e-5
 AXES = ("x", "y", "heading")

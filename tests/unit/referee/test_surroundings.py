@@ -9,13 +9,14 @@ import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import consistency as cs
 from consistency.commands import main
-from consistency.referee.document.blocks import Document
+from consistency.referee import system
 from consistency.referee.parsing import require_name
 from consistency.referee.programs import process
 from consistency.referee.programs.process import program_of
@@ -25,9 +26,9 @@ from consistency.referee.readers.formats.text_blocks import Block, floats, read_
 from consistency.referee.readers.mix_ups.reading_fit import fit_of
 from consistency.referee.readers.truth_matching import make_poses
 from consistency.referee.show import as_md, figures
+from consistency.referee.show.blocks import Document
 from consistency.referee.show.figures import canvas
-from consistency.referee.system import stopping
-from consistency.referee.system.folders import NewFolder, require_free
+from consistency.referee.system import NewFolder, require_free
 
 HEAD = "t,x,y,heading,P_xx,P_xy,P_xh,P_yy,P_yh,P_hh\n"
 
@@ -134,20 +135,20 @@ def test_the_umask_holds(files, mask, folder, file):
 
 
 def test_a_signal_removes_what_is_half_written(tmp_path):
-    before = list(stopping.AT_STOP)
+    before = list(system.AT_STOP)
     with NewFolder(tmp_path / "out", "verdict") as new:
         (new.path / "half").write_text("half")
-        (removal,) = [each for each in stopping.AT_STOP if each not in before]
+        (removal,) = [each for each in system.AT_STOP if each not in before]
         removal()
         assert not new.path.exists()
-    assert before == stopping.AT_STOP
+    assert before == system.AT_STOP
 
 
 REPORTING = """
 import sys, time
 import consistency.commands as cli
 from consistency.__main__ import main
-from consistency.referee.system.folders import NewFolder
+from consistency.referee.system import NewFolder
 from pathlib import Path
 sys.argv = ["consistency", "analyse"]
 def work():
@@ -340,3 +341,17 @@ def test_sound_poses_have_no_variance_that_counts_as_none():
     assert poses.sound().variances.tolist() == [[0.0, 1e-23, 4.0]] * 2
     assert poses.sound().own.covariance[0, 0, 2] == 1e-14
     assert poses.own.covariance[0, 0, 0] == 1e-25
+
+
+def test_the_commit_is_that_of_the_checkout_around_the_package(monkeypatch):
+    asked = []
+
+    def run(command, **_):
+        asked.append(command)
+        return SimpleNamespace(stdout="# branch.oid abc\n1 .M N... consistency/types.py\n")
+
+    monkeypatch.setattr(system.Path, "exists", lambda _: True)
+    monkeypatch.setattr(system.subprocess, "run", run)
+    assert system._git_commit.__wrapped__() == "abc-dirty"
+    assert asked[0][:3] == ["git", "-C", str(Path(system.__file__).parents[2])]
+    assert (Path(asked[0][2]) / "consistency/__init__.py").is_file()

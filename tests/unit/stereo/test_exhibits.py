@@ -20,7 +20,7 @@ from consistency.bench.pages.sections.published_findings import (
     exhibit_blocks,
     listing,
 )
-from consistency.referee.document.blocks import Column, Heading, Stack, Status, Table, Text
+from consistency.referee.show.blocks import Column, Heading, Stack, Status, Table, Text
 
 images, sensor_issues = figures("images"), figures("sensor_issues")
 SECTIONS = (sensor_issues, images)

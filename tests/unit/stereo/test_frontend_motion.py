@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.bench.store.recorded_log import read_log
 from consistency.referee.geometry import spatial_error
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.system import read_manifest
 from consistency.stereo.frontend import FrontendOptions, write_frontend_log
 from consistency.stereo.frontend.camera_truth import read_truth
 from consistency.stereo.frontend.images_to_log import (

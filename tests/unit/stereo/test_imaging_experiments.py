@@ -10,7 +10,7 @@ from scripts import experiment, figures
 import consistency as cs
 from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections.published_findings import exhibit_blocks
-from consistency.referee.document.blocks import Heading, Table
+from consistency.referee.show.blocks import Heading, Table
 from consistency.stereo.rendered_images.chain import MISMATCH, POINT, Stops, Tracks, wall_texture
 from consistency.stereo.rendered_images.scene import Layer, Scene
 

@@ -44,7 +44,7 @@ from numba.extending import intrinsic, register_jitable
 
 from consistency.bench.filters.compiler.dispatch import BODIES, INNER, OPTIONS, PARTS, ROUTINES, Function
 from consistency.bench.models import motion
-from consistency.referee.system.stopping import away_from_signals
+from consistency.referee.system import away_from_signals
 
 _result: Any = CompileResult  # untyped
 _typeof: Callable[[Any], Any] = numba.typeof

@@ -14,8 +14,8 @@ from consistency.referee.diagnostics.sentences import SPREAD
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import STEP, Scale
 from consistency.referee.diagnostics.whitening import mean_and_count
-from consistency.referee.document.blocks import EXPECTED, LIMIT, Figure
 from consistency.referee.pages.verdicts import wide
+from consistency.referee.show.blocks import EXPECTED, LIMIT, Figure
 from consistency.referee.show.figures import add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
 

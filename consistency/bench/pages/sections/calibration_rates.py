@@ -12,7 +12,7 @@ import numpy as np
 
 from consistency.bench.scenario import data_folder
 from consistency.referee.diagnostics.nees import binomial_interval
-from consistency.referee.document.blocks import Block, Cell, Column, Details, Facts, Table, Text
+from consistency.referee.show.blocks import Block, Cell, Column, Details, Facts, Table, Text
 
 NAME = "calibration.json"
 CONFIDENCE = 0.99  # of the interval of a measured share

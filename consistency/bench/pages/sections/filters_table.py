@@ -6,7 +6,7 @@ from typing import Any
 
 from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
-from consistency.referee.document.blocks import Block, Cell, Column, Small, Stack, Status, brief, table
+from consistency.referee.show.blocks import Block, Cell, Column, Small, Stack, Status, brief, table
 
 FILE = "filters.parquet"
 NUMBERS = ["anees", "rmse", "map_nees", "joint_nees", "cost", "failures", "runs", "false_alarm"]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.referee.document.blocks import EXPECTED, Figure, solid
 from consistency.referee.pages.verdicts import Estimator, Judged
+from consistency.referee.show.blocks import EXPECTED, Figure, solid
 from consistency.referee.show.figures import WIDTH, add_legend, band, canvas, curve, stroke
 from consistency.referee.types import Array
 

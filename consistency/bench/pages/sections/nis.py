@@ -10,8 +10,8 @@ import numpy as np
 
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.referee.diagnostics.number_words import names_in_a_row
-from consistency.referee.document.blocks import BAND, EXPECTED, Figure, Look
 from consistency.referee.pages.verdicts import wide
+from consistency.referee.show.blocks import BAND, EXPECTED, Figure, Look
 from consistency.referee.show.figures import canvas, dots, log_axis, owned, points, say, stroke
 from consistency.referee.types import Array
 

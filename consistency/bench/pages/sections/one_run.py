@@ -14,7 +14,7 @@ import numpy as np
 from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.bench.simulation import simulate
-from consistency.referee.document.blocks import ODOMETRY, SIGMAS, TRUTH, ZERO, Figure, Look, solid
+from consistency.referee.show.blocks import ODOMETRY, SIGMAS, TRUTH, ZERO, Figure, Look, solid
 from consistency.referee.show.figures import add_legend, canvas, curve, dots, edges, make_map, path, say, stroke
 from consistency.referee.types import Array, Indices
 

@@ -14,7 +14,9 @@ from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.runs.reproduce_findings import not_run_table
 from consistency.bench.store.parquet import read_frame
 from consistency.bench.types import outcome
-from consistency.referee.document.blocks import (
+from consistency.referee.errors import InputError
+from consistency.referee.parsing import one_line, reading
+from consistency.referee.show.blocks import (
     Block,
     Cell,
     Column,
@@ -28,8 +30,6 @@ from consistency.referee.document.blocks import (
     p_cell,
     table,
 )
-from consistency.referee.errors import InputError
-from consistency.referee.parsing import one_line, reading
 from consistency.referee.show.figures import add_legend, canvas, rows_of
 
 if TYPE_CHECKING:

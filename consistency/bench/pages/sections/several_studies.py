@@ -13,7 +13,9 @@ from consistency.bench.pages.sections.anees import anees_curves
 from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
 from consistency.referee.diagnostics.number_words import names_in_a_row, short
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Interval
-from consistency.referee.document.blocks import (
+from consistency.referee.pages.verdicts import judgement, method
+from consistency.referee.pages.write_pages import facts
+from consistency.referee.show.blocks import (
     BAND,
     EXPECTED,
     Block,
@@ -31,10 +33,8 @@ from consistency.referee.document.blocks import (
     solid,
     table,
 )
-from consistency.referee.document.tables import BRIEF, Measure, cells, columns
-from consistency.referee.pages.verdicts import judgement, method
-from consistency.referee.pages.write_pages import facts
 from consistency.referee.show.figures import add_legend, canvas, dodge, intervals, log_axis, name_rows, stroke
+from consistency.referee.verdicts.tables import BRIEF, Measure, cells, columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -13,14 +13,14 @@ from consistency.bench.pages.sections.nees_distribution import nees_distribution
 from consistency.bench.pages.sections.nis import innovations
 from consistency.bench.pages.sections.one_run import pose_errors, world_map
 from consistency.bench.pages.sections.report_input import Study
-from consistency.referee.document.blocks import Block, Cell, Column, Heading, Name, Text, table
-from consistency.referee.document.tables import BRIEF, FILTER, cells, columns, map_cells, rejection_cells
-from consistency.referee.document.tables import FURTHER as FURTHER_COLUMNS
-from consistency.referee.document.tables import MAP_COLUMNS as MAP_COLUMNS
-from consistency.referee.document.tables import REJECTION_COLUMNS as GUARD_COLUMNS
 from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.pages.ratio_figures import by_axis
 from consistency.referee.pages.verdicts import diagnosis
+from consistency.referee.show.blocks import Block, Cell, Column, Heading, Name, Text, table
+from consistency.referee.verdicts.tables import BRIEF, FILTER, cells, columns, map_cells, rejection_cells
+from consistency.referee.verdicts.tables import FURTHER as FURTHER_COLUMNS
+from consistency.referee.verdicts.tables import MAP_COLUMNS as MAP_COLUMNS
+from consistency.referee.verdicts.tables import REJECTION_COLUMNS as GUARD_COLUMNS
 
 OF_FURTHER = (
     "Noncredibility index and inclination (Li & Zhao 2006): 0 dB is credible, 10 dB a covariance wrong by a factor "

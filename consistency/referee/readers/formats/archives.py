@@ -28,7 +28,7 @@ from consistency.referee.readers.formats.members import UNWEIGHTED
 from consistency.referee.readers.formats.pose_rows import are_rotations, quaternions
 from consistency.referee.readers.formats.sheet import NIS_DOF, are_dof, checked_dof
 from consistency.referee.readers.formats.text_blocks import bounded
-from consistency.referee.readers.mix_ups.hints import turns
+from consistency.referee.readers.mix_ups.hints import swapped, turns
 from consistency.referee.readers.options import GroupOptions, Reading
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.runs_to_record import symmetric
@@ -53,10 +53,6 @@ BY_STEP = TruthFit(  # n NEES / dof of a step with n, the smallest dof, has the 
     caption="the NEES of each step counts over its degrees of freedom, and its distribution is not judged",
 )
 OPTIONAL = {"bounds", "nis", "nis_dof", "axes", "t", "lengths", "mask", "cross_covariances", "truth_covariances"}
-FEWEST = 10  # runs and steps from which on swapped arrays are looked for
-ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
-ALIKE = 0.5  # correlation from run to run
-UNLIKE = 0.2  # of it, from step to step
 KINDS = (
     "errors and covariances; or errors and bounds; or estimates, truth and covariances; or members and truth; or nees "
     "and dof"
@@ -572,29 +568,6 @@ def require_layout(key: str, e: tuple[int, ...], P: tuple[int, ...], where: str 
     if remedy:
         raise InputError(f"{where}{key} has shape {e} and covariances {P}; needed are (runs, steps, n) and "
                          f"(runs, steps, n, n); {remedy}")  # fmt: skip
-
-
-def swapped(name: str, errors: Array) -> list[str]:
-    """A hint where errors (runs, steps, n) correlate from run to run, and not from step to step; none elsewhere."""
-    runs, steps, _ = errors.shape
-    if runs < FEWEST or steps < FEWEST or runs * steps < ENOUGH:
-        return []
-    e = np.where(np.isfinite(errors), errors, 0.0)
-    of_runs, of_steps = (_lag(e - e.mean(axis=axis, keepdims=True), axis) for axis in (0, 1))
-    if of_runs < ALIKE or abs(of_steps) > UNLIKE * of_runs:
-        return []
-    return [
-        f"{name}: errors correlate by {of_runs:.2f} from one run to the next and by {of_steps:.2f} from one step to "
-        "the next, as in arrays (steps, runs, n); the order is (runs, steps, n): np.swapaxes(array, 0, 1) of each"
-    ]
-
-
-def _lag(e: Array, axis: int) -> float:
-    """Mean correlation of errors (runs, steps, n) with their neighbours along an axis, over components."""
-    e = np.moveaxis(e, axis, 0)
-    size = np.square(e).mean(axis=(0, 1))
-    together = (e[1:] * e[:-1]).mean(axis=(0, 1))
-    return float(np.mean(together / np.where(size > 0, size, 1.0)))
 
 
 # --- files of MATLAB ---------------------------------------------------------------------------------

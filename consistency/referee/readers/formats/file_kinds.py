@@ -76,12 +76,11 @@ def is_solution(path: Path) -> bool:
 
 def is_spatial(path: Path, columns: Columns | None = None) -> bool:
     """Whether a table is of poses in space."""
-    return path.suffix.lower() == ".csv" and path.is_file() and is_poses(path, columns)
+    return path.suffix.lower() == ".csv" and path.is_file() and are_poses(path, head_of(path, columns))
 
 
-def is_poses(path: Path, columns: Columns | None = None) -> bool:
+def are_poses(path: Path, head: Head | None) -> bool:
     """Whether a text file is of poses in space: by the names of its columns, or without names."""
-    head = head_of(path, columns)
     return begins_with_numbers(path) if head is None else _are_in_space(head.names, path)
 
 
@@ -92,7 +91,11 @@ def _are_in_space(names: Sequence[str], path: Path) -> bool:
 
 def is_plane(path: Path, columns: Columns | None = None) -> bool:
     """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
-    head = head_of(path, columns)
+    return are_planar(path, head_of(path, columns))
+
+
+def are_planar(path: Path, head: Head | None) -> bool:
+    """Whether a text file with such a head is of planar poses, or of speeds and turn rates."""
     if head is None or clock_of(head.names) is None or _are_in_space(head.names, path):
         return False
     return len(state_columns(head.names, POSE, PLAIN)) == len(POSE) or bool(rates_in(head.names))
@@ -199,6 +202,7 @@ class Head(NamedTuple):
     comment: bool  # it begins with #
     spaced: bool  # by white space
     places: Sequence[int]  # of these columns in the file
+    renaming: Columns | None  # by which some of the names were put in place of its own
 
 
 def head_of(path: Path, columns: Columns | None = None) -> Head | None:
@@ -224,7 +228,7 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
         return None
     is_spaced = not any(mark in line for mark in ",;\t")
     known, places = zip(*renamed(names, columns, path), strict=True)
-    return Head(list(known), number, comment, is_spaced, places)
+    return Head(list(known), number, comment, is_spaced, places, columns)
 
 
 def begins_with_numbers(path: Path) -> bool:

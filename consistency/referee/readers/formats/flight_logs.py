@@ -8,8 +8,8 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,18 +20,12 @@ from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.errors import InputError
 from consistency.referee.extras import MissingPackageError, remedy
 from consistency.referee.parsing import is_file, reading
-from consistency.referee.readers.formats.innovation_files import (
-    MICRO,
-    NisLog,
-    Pairs,
-    choose,
-    numbered_log,
-    require_in_order,
-)
+from consistency.referee.readers.formats.innovation_files import NisLog, choose, numbered_log
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.truth_matching import associate
 from consistency.referee.types import Array
 
+MICRO = 1e-6  # s in the unit of timestamps
 INNOVATIONS, VARIANCES = TOPICS = ("estimator_innovations", "estimator_innovation_variances")
 FLAGS = "estimator_status_flags"  # which sensors the EKF2 fuses
 STATUS = "estimator_status"  # of firmware without these: their bits are in its field ...
@@ -67,6 +61,39 @@ EKFS = {"XKF4": "EK3", "NKF4": "EK2"}  # message with the test ratios, and the p
 TILT = "NKF4"  # whose SVT is a measure of the tilt error
 CORE = "C"  # field of the instance of the EKF
 LEAST = 1.0  # sigma, of a gate: ArduPilot takes a smaller one for it
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Innovations and their variances as the log has them together, N messages."""
+
+    t: Array  # (N,), s, not decreasing; NaN of a clock that stands still
+    innovation: Mapping[str, Array]  # (N,) for each component, as "gps_hpos[0]" or "baro_vpos"
+    variance: Mapping[str, Array]
+    alone: int = 0  # messages of one topic without their partner in the other
+
+    def require_variances(self, path: Path, message: str, where: str) -> None:
+        """Refuse a variance below zero; ``where`` with {field} and {t} says of which."""
+        for field, variance in self.variance.items():
+            for row in np.flatnonzero(variance < 0)[:1]:
+                at = where.format(field=field, t=f"{self.t[row]:.10g} s", value=f"{variance[row]:.4g}")
+                raise InputError(f"{path}: {message}{at}")
+
+    def of(self, parts: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Innovations and variances of some components, (N, n), and which are fused: with a variance above zero."""
+        innovation = np.column_stack([self.innovation[part] for part in parts])
+        variance = np.column_stack([self.variance[part] for part in parts])
+        return innovation, variance, np.isfinite(innovation) & np.isfinite(variance) & (variance > 0)
+
+    def nis(self, parts: Sequence[str]) -> tuple[Array, Array, int]:
+        """NIS (N,), degrees of freedom (N,), and the number of messages that repeat the one before."""
+        innovation, variance, fused = self.of(parts)
+        both = np.nan_to_num(np.hstack([innovation, variance]), nan=np.inf)
+        same = np.append(False, (both[1:] == both[:-1]).all(axis=1))
+        ratio = np.where(fused, np.square(innovation), 0.0) / np.where(fused, variance, 1.0)
+        dof = np.where(same, 0, fused.sum(axis=1)).astype(float)
+        repeated = int((same & fused.any(axis=1)).sum())
+        return np.where(dof > 0, ratio.sum(axis=1), np.nan), dof, repeated
 
 
 def read_ulog(path: Path, sensor: str | None = None, instance: int | None = None) -> NisLog:
@@ -221,6 +248,12 @@ def _paired(path: Path, innovations: Fields, variances: Fields) -> Pairs:
                 own[name] = np.asarray(innovations[name], float)[rows]
                 of[name] = np.asarray(variances[name], float)[match]
     return Pairs(np.full(len(t), np.nan) if stands else t[rows], own, of, len(t) + len(other) - 2 * len(rows))
+
+
+def require_in_order(path: Path, topic: str, t: Array) -> None:
+    """Refuse messages whose times go back."""
+    if len(back := np.flatnonzero(np.diff(t) < 0)):
+        raise InputError(f"{path}: message {back[0] + 2} of {topic} is older than the one before; the log is damaged")
 
 
 def times_of(path: Path, topic: str, stamps: Array) -> Array:

@@ -33,7 +33,7 @@ from consistency.referee.readers.formats.columns import (
     state_columns,
     true_pose_columns,
 )
-from consistency.referee.readers.formats.file_kinds import Head, head_of, is_poses, is_solution
+from consistency.referee.readers.formats.file_kinds import Head, are_poses, head_of, is_solution
 from consistency.referee.readers.formats.positions import read_solution
 from consistency.referee.readers.formats.sheet import OF_ONE_RUN, TableRows, sheet_of
 from consistency.referee.readers.formats.table_columns import times_of
@@ -96,7 +96,7 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
         return _unnamed(path, true, head)
     if not (found.quaternion or true):
         raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}")
-    return _named(path, head, found, true, columns)
+    return _named(path, head, found, true)
 
 
 def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
@@ -105,7 +105,7 @@ def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     found = None if head is None else true_pose_columns(head.names, path)
     if head is None or found is None or not found.quaternion:
         return None
-    lines = _named(path, head, found, True, columns)
+    lines = _named(path, head, found, True)
     finite = finite_rows(lines.values)
     return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
@@ -135,9 +135,9 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
 # --- columns with names ------------------------------------------------------------------------------
 
 
-def _named(path: Path, head: Head, found: PoseColumns, true: bool, columns: Columns | None) -> Lines:
+def _named(path: Path, head: Head, found: PoseColumns, true: bool) -> Lines:
     """Rows under the names of their columns."""
-    sheet = sheet_of(path, head, columns)
+    sheet = sheet_of(path, head, head.renaming)
     if "run" in sheet or "filter" in sheet:
         raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
     names = head.names
@@ -488,7 +488,7 @@ def not_unit(pose: Array) -> tuple[Indices, Array]:
     return np.asarray(bad), length
 
 
-def read_plane(path: Path, motions: bool = False, columns: Columns | None = None) -> tuple[TableRows, str]:
+def read_plane(path: Path, head: Head | None, motions: bool = False) -> tuple[TableRows, str]:
     """A table with planar poses t, x, y, heading of a file that holds them otherwise, and what it was read as.
 
     Speeds and turn rates are integrated, each held from its row to the next: to the motion since the row before, in
@@ -500,24 +500,23 @@ def read_plane(path: Path, motions: bool = False, columns: Columns | None = None
     InputError
         Speeds are of several runs, or a row cannot be read.
     """
-    if is_poses(path, columns):
-        lines = read_poses(path, true=True, columns=columns)
+    if are_poses(path, head):
+        lines = read_poses(path, true=True, columns=None if head is None else head.renaming)
         of = lines.note or f"{path}: read as poses in space"
         return on_plane(lines, "line"), f"{of}, of which the heading is that of the x axis"
-    head = head_of(path, columns)
     assert head is not None
     names = head.names
     clock = clock_of(names)
     assert clock is not None
     poses = state_columns(names, POSE, PLAIN)
-    are_poses = len(poses) == len(POSE)
-    moving = tuple(poses.values()) if are_poses else rates_in(names)
+    has_poses = len(poses) == len(POSE)
+    moving = tuple(poses.values()) if has_poses else rates_in(names)
     require_units([names[place] for place in (*clock.places, *moving)], path)
-    sheet = sheet_of(path, head, columns)
+    sheet = sheet_of(path, head, head.renaming)
     t, unit = times_of(sheet, clock, [sheet.numbers(names[place]) for place in clock.places])
     pose = sheet.matrix(names[place] for place in moving)
     of = "planar poses"
-    if not are_poses:
+    if not has_poses:
         if "run" in sheet or "filter" in sheet:
             raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
         what = "motions" if motions else "poses"

@@ -24,7 +24,7 @@ from consistency.referee.readers.formats.tum import SpaceRun, poses_without_cova
 from consistency.referee.readers.options import COLUMNS, Reading
 from consistency.referee.readers.runs_to_record import MARGINAL
 from consistency.referee.readers.truth_matching import AXES, Estimator, Poses, truth_at
-from consistency.referee.system.progress import with_progress
+from consistency.referee.system import with_progress
 from consistency.referee.types import Array
 
 STATED = ("geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry")  # with a covariance

@@ -15,7 +15,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.readers.formats import table_columns as columns
 from consistency.referee.readers.formats.columns import Columns, covariance_columns, is_pose, naming
-from consistency.referee.readers.formats.file_kinds import begins_with_numbers, head_of, is_drive, is_plane, is_poses
+from consistency.referee.readers.formats.file_kinds import are_planar, are_poses, begins_with_numbers, head_of, is_drive
 from consistency.referee.readers.formats.sheet import TableRows, read_sheet
 from consistency.referee.readers.options import COLUMNS, Reading, flag_of
 from consistency.referee.readers.places import listed
@@ -169,11 +169,11 @@ def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = N
     is_table = head is None and not begins_with_numbers(path)
     if head is not None:
         is_table = not head.comment and set(POSE) <= set(head.names)
-    if is_table or not (is_poses(path, renaming) or is_plane(path, renaming)):
+    if is_table or not (are_poses(path, head) or are_planar(path, head)):
         return read_sheet(path, renaming), ""
     from consistency.referee.readers.formats.pose_rows import read_plane
 
-    return read_plane(path, motions, renaming)
+    return read_plane(path, head, motions)
 
 
 # --- what goes together ------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ from consistency.referee.readers.truth_matching import (
     make_poses,
     unstated,
 )
-from consistency.referee.system.progress import with_progress
+from consistency.referee.system import with_progress
 from consistency.referee.types import Array
 
 OPENVINS = "written by OpenVINS"

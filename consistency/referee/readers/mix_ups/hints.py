@@ -26,6 +26,10 @@ NEARLY_ALL = 0.99  # of the estimates that can be whitened as declared
 NEAR = 5.0  # sigmas: an error of an angle, but for whole turns
 SHARP = 0.5  # rad
 LEAST = 3  # steps
+FEWEST = 10  # runs and steps from which on swapped arrays are looked for
+ENOUGH = 200  # errors, whose correlation then is known to 0.07 where they are independent
+ALIKE = 0.5  # correlation from run to run
+UNLIKE = 0.2  # of it, from step to step
 
 Pairs = Sequence[tuple[Array, Array]]
 ErrorsWithout = Callable[[Change], Pairs]
@@ -209,3 +213,26 @@ def turns(name: str, axes: Sequence[str], error: Array, covariance: Array, remed
                 steps = f"{jumps} of {int(np.isfinite(error[..., k]).sum())} steps"
                 found.append(f"{name}: the error of {axis} is off by {by} in {steps}, as that of an angle; {how}")
     return found
+
+
+def swapped(name: str, errors: Array) -> list[str]:
+    """A hint where errors (runs, steps, n) correlate from run to run, and not from step to step; none elsewhere."""
+    runs, steps, _ = errors.shape
+    if runs < FEWEST or steps < FEWEST or runs * steps < ENOUGH:
+        return []
+    e = np.where(np.isfinite(errors), errors, 0.0)
+    of_runs, of_steps = (_lag(e - e.mean(axis=axis, keepdims=True), axis) for axis in (0, 1))
+    if of_runs < ALIKE or abs(of_steps) > UNLIKE * of_runs:
+        return []
+    return [
+        f"{name}: errors correlate by {of_runs:.2f} from one run to the next and by {of_steps:.2f} from one step to "
+        "the next, as in arrays (steps, runs, n); the order is (runs, steps, n): np.swapaxes(array, 0, 1) of each"
+    ]
+
+
+def _lag(e: Array, axis: int) -> float:
+    """Mean correlation of errors (runs, steps, n) with their neighbours along an axis, over components."""
+    e = np.moveaxis(e, axis, 0)
+    size = np.square(e).mean(axis=(0, 1))
+    together = (e[1:] * e[:-1]).mean(axis=(0, 1))
+    return float(np.mean(together / np.where(size > 0, size, 1.0)))

@@ -144,8 +144,10 @@ def record_of_arrays(
         if reading.statement.ensemble is not None or are_repeats:
             from consistency.referee.diagnostics.normal_numbers import of_ensemble, of_repeats
 
-            record = of_repeats(record) if are_repeats else record
-            record = record if reading.statement.ensemble is None else of_ensemble(record, reading.statement.ensemble)
+            if are_repeats:
+                record = of_repeats(record)
+            if reading.statement.ensemble is not None:
+                record = of_ensemble(record, reading.statement.ensemble)
     except InputError as error:
         raise InputError(_in_python(str(error), sigma is not None)) from None
     failures = tuple(replace(failure, filter=name) for failure in record.failures)

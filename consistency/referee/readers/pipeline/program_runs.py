@@ -39,7 +39,7 @@ from consistency.referee.readers.truth_matching import (
     StatedError,
     make_poses,
 )
-from consistency.referee.system.folders import read_manifest
+from consistency.referee.system import read_manifest
 
 RUN_KIND = "run of a program"  # of run.json: a program may write a file of that name itself
 LOG = "program.log"  # standard output and error of a run
@@ -382,8 +382,9 @@ def log_lines(path: Path, lines: int) -> list[str]:
 
 def _needs_truth(path: Path, r: Reading) -> bool:
     """Whether no column of a text file of estimates is a truth, an innovation or a NIS."""
-    head = head_of(path, r.components.columns) if path.suffix.lower() in (".csv", *TRAJECTORIES) else None
-    names = [] if head is None else head.names
+    names = []
+    if path.suffix.lower() in (".csv", *TRAJECTORIES) and (head := head_of(path, r.components.columns)) is not None:
+        names = head.names
     return not (has_nis(names) or any(stem_of(name, TRUE) for name in names))
 
 

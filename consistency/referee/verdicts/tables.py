@@ -27,7 +27,8 @@ from consistency.referee.diagnostics.sentences import question_text
 from consistency.referee.diagnostics.status import axis_at_fault
 from consistency.referee.diagnostics.verdict import MapScore, Verdict
 from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
-from consistency.referee.document.blocks import (
+from consistency.referee.geometry import ADDITIVE, PLANAR
+from consistency.referee.show.blocks import (
     NONE,
     PLAIN,
     Block,
@@ -46,11 +47,10 @@ from consistency.referee.document.blocks import (
     table,
     written,
 )
-from consistency.referee.geometry import ADDITIVE, PLANAR
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.comparison import Comparison, Difference
-    from consistency.referee.document.blocks import Look
+    from consistency.referee.show.blocks import Look
 
 FILTER = Column("Filter")
 IN_WORLD = 3  # of these are shown of the additive error, too
@@ -474,8 +474,9 @@ def plan_lines(planned: dict[str, Any]) -> list[str]:
     A pilot tells how much its runs spread, and not how skewed they are: its power is that of axes and runs alike.
     """
     p = planned
-    side = "small" if p["detect"] > 1.0 else "large"
-    factor = p["detect"] if p["detect"] > 1.0 else 1.0 / p["detect"]
+    side, factor = "small", p["detect"]
+    if factor <= 1.0:
+        side, factor = "large", 1.0 / factor
     lines = [
         f"{p['runs']} runs: a verdict at false alarm {p['false_alarm']:g} then finds a covariance too {side} by "
         f"x{factor:.3g} with power {p['power']:g}"

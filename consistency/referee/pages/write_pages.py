@@ -17,6 +17,7 @@ from consistency.referee.diagnostics.number_words import plural, with_subject
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.document.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
+from consistency.referee.document.tables import region_tables
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
@@ -246,7 +247,8 @@ def compose_files(
         shown: tuple[Block, ...] = *sentence, *at_once, *unfolded
         chapters.append(Chapter(f"estimator-{i}", name, name, shown, _counts(named[name], verdict)))
     blocks = (
-        *verdicts.judgement(study), *verdicts.bounds_tables(study), *questions_table.diagnosis(study), *by_axis(study),
+        *verdicts.judgement(study), *verdicts.bounds_tables(study), *region_tables(judged),
+        *questions_table.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].origin.notes))

@@ -11,17 +11,16 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.gating.checked_input import (
     Sides,
-    bound_gate_runs,
     of_arrays,
     of_filters,
     planned_detect,
     planned_dof,
+    planned_runs,
     rate_shares,
     record_of_checked,
     record_of_filter,
@@ -311,12 +310,7 @@ def _judged(
         return GateResult(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        if record.errors.bounds:
-            return bound_gate_runs(record, demand)
-        detect = planned_detect(record, demand.detect)
-        return gate_runs(
-            planned_dof(record), detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
-        )
+        return planned_runs(record, demand, rate)
 
     result = _settle(gate, record, demand, look, needed)
     assert result.verdict is not None

@@ -471,10 +471,8 @@ def test_bad_arrays_are_refused():
 
 def test_commands_for_covariances_refuse_bounds(tmp_path, capsys):
     path = table(tmp_path / "est.csv", lambda x, y: {"bound_x": 2.0})
-    program = ("--out", tmp_path / "o", "--", "true")
     for words in (("baseline", path, "--out", tmp_path / "b.json"), ("compare", path, path)):
         assert "--gaussian" in refused(capsys, *words, "--level", "95%")
-    assert "--gaussian" in refused(capsys, "monte-carlo", "--level", "95%", *program)
 
 
 # --- alert limits ------------------------------------------------------------------------------------------------

@@ -453,6 +453,27 @@ def test_bad_bounds_are_refused_in_one_sentence(tmp_path, capsys, columns, words
         assert part in err
 
 
+@pytest.mark.parametrize(
+    ("name", "words", "parts"),
+    [
+        ("est.tum", "--level 95%", ("--level: does not go with", "covariances alone", "radius_x_y", ".npz")),
+        ("est.tum", "--level 95% --alert-limit 4", ("--level", "table")),
+        ("est.tum", "--members x=e*", ("--members", "columns of --members")),
+        ("est.bag", "--level 95%", ("--level", "radius_x_y")),
+        ("log.ulg", "--level 95%", ("flight logs", "eph", "radius_x_y with --level")),
+        ("log.bin", "--level 95%", ("flight logs", "eph", "radius_x_y with --level")),
+    ],
+)
+def test_files_that_hold_no_bounds_name_the_way(tmp_path, capsys, name, words, parts):
+    rows = "".join(f"{k / 10} {k} 0 0 0 0 0 1\n" for k in range(40))
+    for file in (name, "truth.tum"):
+        (tmp_path / file).write_bytes(b"#ROSBAG V2.0\n" if file.endswith(".bag") else rows.encode())
+    truth = () if name.endswith((".ulg", ".bin", ".bag")) else ("--truth", tmp_path / "truth.tum")
+    err = refused(capsys, "analyse", tmp_path / name, *truth, *words.split())
+    for part in parts:
+        assert part in err
+
+
 def test_bad_arrays_are_refused():
     e, bounds = errors(5), np.ones((5, 40, 1))
     with pytest.raises(cs.InputError, match=r"bounds need their level"):

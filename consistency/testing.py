@@ -11,17 +11,16 @@ from numpy.typing import ArrayLike
 
 from consistency.referee.diagnostics.comparison import FEWEST, Comparison
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.gating.checked_input import (
     Sides,
-    bound_gate_runs,
     of_arrays,
     of_filters,
     planned_detect,
     planned_dof,
+    planned_runs,
     rate_shares,
     record_of_checked,
     record_of_filter,
@@ -232,6 +231,11 @@ def assert_not_worse(
     filter: str | None = None,
     than: str | None = None,
     reference: Tables | Baseline | str | Path | None = None,
+    members_a: ArrayLike | None = None,
+    members_b: ArrayLike | None = None,
+    truth: ArrayLike | str | None = None,
+    ensemble: int | None = None,
+    independent: bool = False,
     nees_a: ArrayLike | None = None,
     nees_b: ArrayLike | None = None,
     dof: int | None = None,
@@ -252,6 +256,8 @@ def assert_not_worse(
     errors_a, covariances_a, errors_b, covariances_b : as in :func:`assert_consistent`; row i of both is one trial
     deviations_a, deviations_b : in place of covariances, as in :func:`assert_consistent`; the mean NEES without cross
         terms is that of a right filter under any correlation
+    members_a, members_b, truth, ensemble, independent : of both, as in :func:`assert_consistent`; ranks among as many
+        members are compared. Bounds are not: two verdicts have their factors
     nees_a, nees_b, dof : (runs, steps) and the dimension of the error, in place of them
     filter, than : names of the candidate and its reference, in results given as ``errors_a``
     reference : other results, or a baseline or its file, in place of the same results; ``than`` is then ``filter``
@@ -277,7 +283,8 @@ def assert_not_worse(
     arrays: dict[str, Any] = {
         "covariances_a": covariances_a, "errors_b": errors_b, "covariances_b": covariances_b,
         "deviations_a": deviations_a, "deviations_b": deviations_b, "nees_a": nees_a, "nees_b": nees_b, "dof": dof,
-        "axes": axes,
+        "axes": axes, "members_a": members_a, "members_b": members_b, "truth": truth, "ensemble": ensemble,
+        "independent": independent or None,
     }  # fmt: skip
     if filter is not None or hasattr(errors_a, "estimates"):
         _refuse(arrays, "results bring their own; the reference is named by than and reference")
@@ -288,8 +295,11 @@ def assert_not_worse(
         if nees_a is not None and dof is None:
             dof = current().marked.get("dof")
         both: dict[str, Any] = {"dof": dof, "axes": axes, "skip": skip}
-        a = {"errors": errors_a, "covariances": covariances_a, "deviations": deviations_a, "nees": nees_a, **both}
-        b = {"errors": errors_b, "covariances": covariances_b, "deviations": deviations_b, "nees": nees_b, **both}
+        both |= {"truth": truth, "ensemble": ensemble, "independent": independent}
+        a = {"errors": errors_a, "covariances": covariances_a, "deviations": deviations_a, "nees": nees_a}
+        b = {"errors": errors_b, "covariances": covariances_b, "deviations": deviations_b, "nees": nees_b}
+        a |= {"members": members_a, **both}
+        b |= {"members": members_b, **both}
         sides = of_arrays(name or "the candidate", a, b)
     return _compare(sides, demand)
 
@@ -311,12 +321,7 @@ def _judged(
         return GateResult(bad, sure, verdict.p_value, verdict.status, list(verdict.reasons), verdict)
 
     def needed(rate: float) -> int:
-        if record.errors.bounds:
-            return bound_gate_runs(record, demand)
-        detect = planned_detect(record, demand.detect)
-        return gate_runs(
-            planned_dof(record), detect, rate / rate_shares(record), demand.power, demand.allow, demand.lost
-        )
+        return planned_runs(record, demand, rate)
 
     result = _settle(gate, record, demand, look, needed)
     assert result.verdict is not None
@@ -344,7 +349,8 @@ def _compare(sides: Sides, demand: Terms) -> Comparison:
         return GateResult(worse, sides.failed_more, comparison.p_value, status, reasons, None, comparison)
 
     def needed(rate: float) -> int:
-        return sides.compare(rate).needed_runs(demand.detect, demand.power)
+        detect = planned_detect(sides.candidate, demand.detect)
+        return sides.compare(rate).needed_runs(detect, demand.power)
 
     result = _settle("assert_not_worse", sides.candidate, demand, look, needed)
     assert result.comparison is not None

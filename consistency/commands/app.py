@@ -39,6 +39,7 @@ PANELS = {  # of the options of commands that read files
         "topic", "truth_topic", "columns", "truth_columns", "world", "body_axes", "truth_world", "truth_body_axes",
         "filters", "name", "axes", "covariance_order", "body", "truth_covariance", "truth_errors", "truth_shared",
         "split", "motions", "dof", "second", "independent", "members", "ensemble", "level", "gaussian", "ends",
+        "alert_limit",
     ),
     "How to align": ("max_dt", "time_offset", "lever_arm", "windows"),
     "What to run": (
@@ -54,6 +55,7 @@ SELDOM = {  # options that --help-all alone shows
     "covariance_order", "body", "truth_covariance", "truth_errors", "truth_shared", "motions", "windows", "dof",
     "lever_arm", "truth_columns", "body_axes", "truth_world", "truth_body_axes", "bins", "by_file", "tolerance", "lost",
     "confidence", "verbose", "max_dt", "members", "ensemble", "ends", "gaussian",
+    "alert_limit",
 }  # fmt: skip
 
 

@@ -177,7 +177,7 @@ def correct_command(
         from consistency.referee.fit_covariance.fit_files import write_bound_correction, write_correction
 
         if isinstance(found, BoundCorrection):
-            written = write_bound_correction(found, out, overwrite)
+            written = write_bound_correction(found, record.groups, texts, out, overwrite)
         else:
             written = write_correction(found, record, texts, out, overwrite)
     shown = bound_correction_document(found) if isinstance(found, BoundCorrection) else correction_document(found)

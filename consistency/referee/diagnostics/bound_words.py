@@ -8,9 +8,10 @@ import numpy as np
 
 from consistency.referee.diagnostics.number_words import MOST, names_in_a_row, percent, plural, ratio_text, short
 from consistency.referee.diagnostics.verdict import Findings
-from consistency.referee.diagnostics.verdict_parts import SIDES, BoundScore, Interval
+from consistency.referee.diagnostics.verdict_parts import HAZARD, REGIONS, SIDES, Alerts, BoundScore, Interval
 
 DEPENDENCE = "however their steps depend on each other"
+NEVER = 3.0  # of N runs none is outside: rates from 3 / N on are excluded at 95 %, -ln(.05) / N
 
 
 def factor_text(factor: Interval) -> str:
@@ -73,6 +74,7 @@ def _clearness(score: BoundScore) -> tuple[float, float]:
 def lines_of_bounds(v: Findings) -> list[str]:
     """A line for each bound and group, then what missing steps count as."""
     lines = [_line(score, v.unit) for score in v.bounds]
+    lines += [_hazard(score, score.alerts, v.unit) for score in v.bounds if score.alerts is not None]
     missing = max((score.missing for score in v.bounds), default=0)
     if missing:
         lines.append(
@@ -142,6 +144,16 @@ def _advice(v: Findings, scores: Sequence[BoundScore]) -> str:
     if most <= v.runs:
         return ""
     return f"; {most} {v.unit}s show it of a right bound in {percent(v.settings.power)} of all cases {DEPENDENCE}"
+
+
+def _hazard(score: BoundScore, alerts: Alerts, unit: str) -> str:
+    """How often a bound is hazardously misleading, and what no data of this size can show."""
+    runs = plural(score.runs, unit)
+    return (
+        f"{score.name} is {REGIONS[HAZARD]} at an alert limit of {short(alerts.limit)} in "
+        f"{percent(alerts.shares[HAZARD])} of the steps; {percent(alerts.hazard_limit)} or more is excluded. {runs} "
+        f"never show a rate below {percent(min(1.0, NEVER / score.runs))} (3 / N), and 1e-7 takes 30 million {unit}s"
+    )
 
 
 def _line(score: BoundScore, unit: str) -> str:

@@ -25,6 +25,9 @@ from consistency.referee.diagnostics.exceedance import (
 from consistency.referee.diagnostics.record import Bound, Record
 from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.diagnostics.verdict_parts import (
+    HAZARD,
+    REGIONS,
+    Alerts,
     Answer,
     BoundScore,
     Equivalence,
@@ -45,6 +48,7 @@ class Question(NamedTuple):
     bound: Bound
     ratios: Array  # (runs, steps), with their signs; NaN where a step does not count
     sizes: Exceedance
+    regions: Array | None  # (runs, steps), of the Stanford diagram, where the bound has an alert limit
     group: str
     judged: bool
 
@@ -102,14 +106,18 @@ def _questions(record: Record) -> Iterator[Question]:
         if bound.ends_independent:
             missing = np.zeros_like(missing)
         sizes = Exceedance(np.abs(ratios), missing, bound.level)
-        yield Question(bound.name, bound, ratios, sizes, "", sizes.runs > 0)
+        regions = None
+        if bound.alert_limit is not None and record.errors.regions is not None:
+            regions = record.errors.regions[..., i]
+        yield Question(bound.name, bound, ratios, sizes, regions, "", sizes.runs > 0)
         for number, name in enumerate(() if groups is None else groups.names):
             assert groups is not None
             some = np.where(groups.index == number, ratios, np.nan)
             in_group = Exceedance(np.abs(some), np.zeros_like(missing), bound.level)
             if in_group.runs:
                 judged = not groups.outcome and not missing.any()
-                yield Question(f"{bound.name} where {name}", bound, some, in_group, name, judged)
+                of_group = None if regions is None else np.where(groups.index == number, regions, np.nan)
+                yield Question(f"{bound.name} where {name}", bound, some, in_group, of_group, name, judged)
 
 
 def _shares(asked: Sequence[Question]) -> dict[str, float]:
@@ -144,8 +152,22 @@ def _score(q: Question, settings: Settings, given: Sequence[Answer], is_fault: b
     return BoundScore(
         q.name, q.bound.level, factor, q.sizes.rate(), q.sizes.rate_limit(), above, below, q.sizes.runs,
         int((~np.isnan(q.ratios)).sum()), int(q.sizes.missing.sum()), fewest_runs(q.bound.level, shown.level),
-        adjusted.get(q.name, float("nan")), shown, status, q.group,
+        adjusted.get(q.name, float("nan")), shown, status, q.group, _alerts(q),
     )  # fmt: skip
+
+
+def _alerts(q: Question) -> Alerts | None:
+    """Shares of the steps in the regions of the Stanford diagram; None without an alert limit."""
+    if q.regions is None or q.bound.alert_limit is None:
+        return None
+
+    def of(region: int) -> Exceedance:
+        """Steps in a region as those outside a bound."""
+        is_inside = np.where(np.isnan(q.regions), np.nan, 2.0 * (q.regions == region))
+        return replace(q.sizes, ratios=is_inside)
+
+    shares = tuple(of(region).rate() for region in range(len(REGIONS)))
+    return Alerts(q.bound.alert_limit, shares, of(HAZARD).rate_limit())
 
 
 def _share_of_side(ratios: Array) -> float:

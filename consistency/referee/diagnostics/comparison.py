@@ -11,7 +11,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics.nees import Contrast, contrast, margin
-from consistency.referee.diagnostics.record import numbered_axes
+from consistency.referee.diagnostics.record import Record, numbered_axes
 from consistency.referee.diagnostics.scale import run_means
 from consistency.referee.diagnostics.whitening import by_runs
 from consistency.referee.types import Array, Indices
@@ -29,6 +29,7 @@ class RunSummary:
     nees: Array  # (R,), mean NEES over dof
     squared: Array  # (R, n) or (R, 0), mean squared error of each axis
     covered: Array  # (R, n) or (R, 0), share of steps within 2 sigma
+    kind: str = ""  # what the NEES are of, if not of errors and covariances; only the same kinds are compared
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,7 @@ def summary(
     error: Array | None = None,
     covariance: Array | None = None,
     runs: Indices | None = None,
+    kind: str = "",
 ) -> RunSummary:
     """One row for each run, from NEES (runs, steps) and, where known, error and covariance."""
     means, _ = run_means(nees)
@@ -112,7 +114,22 @@ def summary(
         covered = both[:, 1]
     if runs is None:
         runs = np.arange(len(nees))
-    return RunSummary(runs, dof, means / dof, squared, covered)
+    return RunSummary(runs, dof, means / dof, squared, covered, kind)
+
+
+def summary_of(record: Record) -> RunSummary:
+    """A row for each run of a record that has NEES; numbers of ensembles have no RMSE, and say what they are."""
+    nees = record.errors.nees
+    assert nees is not None
+    world = record.in_world.errors
+    table = record.table()
+    if record.errors.ensemble is None or table is None:
+        return summary(nees, record.errors.dof, world.error, world.covariance, record.run_numbers)
+    kind = (
+        f"numbers of {record.errors.ensemble.members} members, in which a covariance ratio of 2 shows as "
+        f"{table.mean_square(2.0):.2f}"
+    )
+    return summary(nees, record.errors.dof, runs=record.run_numbers, kind=kind)
 
 
 def _squared_and_covered(nees: Array, error: Array, covariance: Array) -> Array:
@@ -165,6 +182,9 @@ def compare(
     """
     if a.dof != b.dof:
         raise ValueError(f"the errors have {a.dof} and {b.dof} dimensions; compare filters of the same state")
+    if a.kind != b.kind:
+        kinds = (one.kind or "errors with covariances" for one in (a, b))
+        raise ValueError(f"{' cannot be compared with '.join(kinds)}; give both with as many members")
     common = np.intersect1d(a.runs[np.isfinite(a.nees)], b.runs[np.isfinite(b.nees)])
     if paired is None:
         paired = len(common) >= FEWEST

@@ -78,6 +78,7 @@ class Bound(NamedTuple):
     components: tuple[str, ...]
     level: float  # share of the steps in which the error is inside
     ends_independent: bool = False  # declared: where runs end, and which are lost, does not depend on the errors
+    alert_limit: float | None = None  # above which a bound alerts its user, who then does not rely on it
 
 
 class Ensemble(NamedTuple):
@@ -135,8 +136,11 @@ class Errors:
     ensemble: Ensemble | None = None  # of which the errors are normal numbers, as ranks among members are
     bounds: tuple[Bound, ...] = ()  # that are judged in place of covariances
     bound_ratios: Array | None = None  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
+    regions: Array | None = (
+        None  # (runs, steps, bounds), places in REGIONS; NaN without an alert limit, or as the error
+    )
 
-    OF_RUNS: ClassVar = ("error", "covariance", "nees", "bound_ratios")
+    OF_RUNS: ClassVar = ("error", "covariance", "nees", "bound_ratios", "regions")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -353,6 +357,7 @@ class Record:
             "nis_dof": self.innovations.nis_dof,
             "values": self.innovations.values,
             "bound_ratios": self.errors.bound_ratios,
+            "regions": self.errors.regions,
         }
         if self.world is not None:
             arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
@@ -369,7 +374,11 @@ class Record:
         return replace(
             self,
             errors=replace(
-                self.errors, covariance=rest["covariance"], nees=rest["nees"], bound_ratios=rest["bound_ratios"]
+                self.errors,
+                covariance=rest["covariance"],
+                nees=rest["nees"],
+                bound_ratios=rest["bound_ratios"],
+                regions=rest["regions"],
             ),
             innovations=replace(self.innovations, nis=rest["nis"], nis_dof=rest["nis_dof"], values=rest["values"]),
             runs=replace(self.runs, skipped=skipped),

@@ -15,6 +15,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.record import Record, Skipped, shown_by
 from consistency.referee.diagnostics.verdict_parts import (
+    REGIONS,
     TINY,
     Accuracy,
     Answer,
@@ -527,6 +528,9 @@ def bound_numbers(bounds: tuple[BoundScore, ...]) -> Numbers:
     scores = []
     for one in bounds:
         numbers = vars(one) | {"factor": one.factor.value, "factor_interval": tuple(one.factor[1:])}
+        if one.alerts is not None:
+            shares = dict(zip(REGIONS, one.alerts.shares, strict=True))
+            numbers |= {"alerts": one.alerts._asdict() | {"shares": shares}}
         scores.append(numbers | {"equivalence": equivalence_numbers(one.equivalence)})
     return {"bounds": scores}
 

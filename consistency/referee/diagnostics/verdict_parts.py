@@ -208,6 +208,29 @@ class ByGroup:
         return max(self.groups, key=lambda group: abs(_log(group.ratio.value)))
 
 
+REGIONS = (
+    "nominal operation",
+    "misleading",
+    "hazardously misleading",
+    "unavailable",
+    "unavailable and misleading",
+)  # of the Stanford diagram
+HAZARD = 2  # its place
+
+
+class Alerts(NamedTuple):
+    """Shares of the steps in the regions of the Stanford diagram of a bound and its alert limit.
+
+    A bound above the limit makes the system *unavailable*. An error outside its bound is *misleading*, and
+    *hazardously* so if it is above the limit while the bound is not (Tossaint et al. 2007, The Stanford-ESA integrity
+    diagram).
+    """
+
+    limit: float
+    shares: tuple[float, ...]  # of REGIONS, means over runs
+    hazard_limit: float  # rates of hazardously misleading steps from here on are excluded at 95 %
+
+
 @dataclass(frozen=True)
 class BoundScore:
     """How often the error leaves a bound, of all steps or of a group of them, and the factor that it needs."""
@@ -227,6 +250,7 @@ class BoundScore:
     equivalence: Equivalence  # of the factor
     status: str  # overconfident, conservative, consistent or undecided; "" where it is not judged
     group: str = ""
+    alerts: Alerts | None = None  # where the bound has an alert limit
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ class BoundCorrection:
     held_out: str  # "in turn", "half" or names
     fitted: tuple[str, ...]  # names of runs
     judged: tuple[str, ...]
+    numbers: tuple[int, ...]  # of the judged runs
     before: Verdict = field(repr=False)  # the judged runs as they are stated
     after: Verdict = field(repr=False)
     rates: Mapping[str, Interval]  # share of steps outside the corrected bound, held out, 95 %, by bound
@@ -112,6 +113,7 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
         names = ("",) if some.groups is None else some.groups.names
         in_group = index == names.index(factor.group) if factor.group or some.groups is None else index < 0
         ratios[..., b] = np.where(in_group, some.errors.bound_ratios[..., b] / np.array(own)[:, None], ratios[..., b])
+    some = replace(some, errors=replace(some.errors, regions=None))  # of the bounds as they are stated
     corrected = replace(some, errors=replace(some.errors, bound_ratios=ratios))
     rates = {
         bound.name: Exceedance(np.abs(ratios[..., b]), np.zeros(len(ratios), int), bound.level).rate_interval()
@@ -119,7 +121,8 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
     }
     before, after = (judge_all([each])[record.name] for each in (some, corrected))
     names_of = tuple(labels[i] for i in fitted), tuple(labels[i] for i in judged)
-    return BoundCorrection(record.name, factors, held_out or IN_TURN, *names_of, before, after, rates)
+    numbers = tuple(some.run_numbers.tolist())
+    return BoundCorrection(record.name, factors, held_out or IN_TURN, *names_of, numbers, before, after, rates)
 
 
 def _factors(record: Record, b: int, in_turn: bool) -> list[BoundFactor]:

@@ -37,7 +37,7 @@ from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.noise_model import NoiseModel, correction, data_of_model, noise_document
 from consistency.referee.fit_covariance.pictures import draw_correction, draw_noise
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
-from consistency.referee.readers.formats.restated import TextFile
+from consistency.referee.readers.formats.restated import Factors, TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
 from consistency.referee.show import as_html, as_json
 from consistency.referee.show.blocks import Chapter, Document, Figure, Status, Text
@@ -261,11 +261,54 @@ def write_correction(
     return write_fit(folder, ("correction", found.name), texts, correction_page(found), write, overwrite)
 
 
-def write_bound_correction(found: BoundCorrection, folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the factors of bounds, and a page; its files."""
+def write_bound_correction(
+    found: BoundCorrection, groups: Groups | None, files: Sequence[TextFile], folder: Path, overwrite: bool = False
+) -> list[Path]:
+    """Write the factors of bounds, the tables that state them by these factors, and a page; its files.
+
+    Parameters
+    ----------
+    groups : of the record, by whose factors lines are written
+    files : tables of the bounds; without any no table is written
+    """
     texts = {"correction.toml": toml(f"{found.status} after: {HEAD_OF_BOUNDS}", data_of_bounds(found))}
     kind = "bound-correction", found.name
-    return write_fit(folder, kind, texts, bound_correction_document(found), lambda at: [], overwrite)
+    if groups is not None and not all(file.by_column is not None for file in files):
+        files = ()
+    write = partial(_write_bounds, found, groups, files)
+    return write_fit(folder, kind, texts, bound_correction_document(found), write, overwrite)
+
+
+def _write_bounds(found: BoundCorrection, groups: Groups | None, files: Sequence[TextFile], folder: Path) -> list[str]:
+    """Write held-out/ and corrected/, as :func:`_write_runs`, of tables; the names of what ``analyse`` reads."""
+    own: dict[int, dict[tuple[str, str], float]] = {}  # factors by bound and group, of each judged run
+    for number, label in zip(found.numbers, found.judged, strict=True):
+        row = found.fitted.index(label) if label in found.fitted else None
+        own[number] = {
+            (one.bound.name, one.group): one.factor if row is None else float(one.left_out[row])
+            for one in found.factors
+        }
+    of_all = {(one.bound.name, one.group): one.factor for one in found.factors}
+
+    def change(of_runs: Mapping[int, dict[tuple[str, str], float]] | None, run: int, value: str) -> Factors | None:
+        if of_runs is not None and run not in of_runs:
+            return None
+        place = place_in(groups, value)
+        group = "" if groups is None or place < 0 else groups.names[place]
+        factors = of_all if of_runs is None else of_runs[run]
+        return {bound: (factor**2, 0.0) for (bound, of), factor in factors.items() if of == group}
+
+    made = []
+    for name, of_runs in ((HELD_OUT, own), (CORRECTED, None)):
+        are_known = len(files) > 1 or any(file.run_column is not None for file in files)
+        if not files or (of_runs is not None and not (are_known and found.after.unit == "run")):
+            continue  # pieces and rows of one log are not told in its file
+        (folder / name).mkdir()
+        for file in files:
+            if of_runs is None or file.run_column is not None or file.run in of_runs:
+                (folder / name / file.path.name).write_text(file.restated(partial(change, of_runs)), encoding="utf-8")
+        made.append(f"{name}/{files[0].path.name}" if len(files) == 1 else name)
+    return made
 
 
 def _write_runs(found: Correction, record: Record, files: Sequence[TextFile], folder: Path) -> list[str]:

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary
+from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary_of
+from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.record import InnovationRecord, Record, Skip, skip_of
+from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.diagnostics.whiteness import nis_of
 from consistency.referee.errors import InputError
 from consistency.referee.gating.session import Terms
@@ -116,11 +118,17 @@ def record_of_checked(
         raise ValueError(str(error).removeprefix("--")) from None
 
 
-def bound_gate_runs(record: Record, terms: Terms) -> int:
-    """Runs with which a gate passes right bounds, however steps depend on each other; a million at most."""
-    from consistency.referee.diagnostics.exceedance import LARGEST, runs_to_show
+def planned_runs(record: Record, terms: Terms | Settings, rate: float) -> int:
+    """Runs with which a right record is shown to be right, or a wrong one is found, at a false-alarm ``rate``.
 
-    return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
+    Of bounds those that show right ones, however steps depend on each other; a million at most.
+    """
+    if record.errors.bounds:
+        from consistency.referee.diagnostics.exceedance import LARGEST, runs_to_show
+
+        return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
+    detect = planned_detect(record, terms.detect)
+    return gate_runs(planned_dof(record), detect, rate / rate_shares(record), terms.power, terms.allow, terms.lost)
 
 
 def planned_detect(record: Record, detect: float) -> float:
@@ -410,7 +418,7 @@ def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunS
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     assert case.errors.nees is not None
-    return case, summary(case.errors.nees, case.errors.dof, case.errors.error, case.errors.covariance)
+    return case, summary_of(case)
 
 
 def of_filters(

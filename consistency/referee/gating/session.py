@@ -334,7 +334,7 @@ def needed_at(entry: Entry, rate: float) -> int:
         detect = entry.planned_detect or entry.detect
         return gate_runs(entry.dof, detect, rate / entry.parts, entry.power, entry.allow, entry.lost)
     comparison = Comparison(entry.runs, True, (), 0.0, entry.standard_error, 1.0, rate, **entry.spread)
-    return comparison.needed_runs(entry.detect, entry.power)
+    return comparison.needed_runs(entry.planned_detect or entry.detect, entry.power)
 
 
 def ending(ledger: Ledger) -> str:

@@ -82,6 +82,7 @@ def read(
     level: str | float | Mapping[str, Any] | None = None,
     gaussian: bool = False,
     ends: str | None = None,
+    alert_limit: str | float | Mapping[str, Any] | None = None,
     by: str | None = None,
     by_file: str | Path | None = None,
     bins: int | Sequence[float] | None = None,
@@ -128,6 +129,7 @@ def read(
     truth_shared : the estimator has fused the truth
     level : of bounds, radii and intervals in columns ``bound_x``, ``radius_x_y``, ``x_low`` and ``x_high``, or the key
         ``bounds``: 0.95, "95%", "2sigma", "CEP"; or by name, ``{"bound_x": 0.95}``
+    alert_limit : of protection levels, in their unit, or by name: the verdict has the shares of the Stanford diagram
     gaussian : read them, or deviations at that level, as the covariance of a Gaussian, circular for radii
     ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
     by : column whose values make groups, in each of which the size of the errors is judged, too: words as they are,
@@ -168,7 +170,10 @@ def read(
         truth=TruthOptions(
             truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None
         ),
-        statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, dof=dof, ensemble=ensemble),
+        statement=StatementOptions(
+            level=level, gaussian=gaussian or None, ends=ends, dof=dof, ensemble=ensemble,
+            alert_limit=alert_limit,
+        ),
         groups=GroupOptions(by=by, by_file=None if by_file is None else Path(by_file), bins=bins),
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
@@ -223,6 +228,7 @@ def judge(
     level: str | float | Mapping[str, Any] | None = None,
     gaussian: bool = False,
     ends: str | None = None,
+    alert_limit: str | float | Mapping[str, Any] | None = None,
     axes: Sequence[str] | None = None,
     independent: bool = False,
     name: str = "estimator",
@@ -260,6 +266,8 @@ def judge(
     gaussian : bounds, or deviations and covariances at that level, stand for the covariance of a Gaussian, which is
         judged
     ends : "independent" declares that ends of runs and lost runs do not depend on the errors (bounds)
+    alert_limit : of bounds that are protection levels, in their unit, or by name: the verdict then has the shares of
+        the steps in each region of the Stanford diagram
     axes : (n,) names of the components of errors
     independent : each row is an independent run of one step. Errors may then be (N, n), with covariances (N, n, n) or
         deviations (N, n); of a path its rows are runs
@@ -286,8 +294,11 @@ def judge(
         raise InputError(f"{', '.join(stated)}: give one of them beside errors")
     if "weights" in settings:
         raise InputError(f"weights: {UNWEIGHTED}")
-    options = Reading(statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble))
-    if bounds is not None or options.given(("level", "gaussian", "ends")):
+    statement = StatementOptions(
+        level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble, alert_limit=alert_limit
+    )
+    options = Reading(statement=statement)
+    if bounds is not None or options.given(("level", "gaussian", "ends", "alert_limit")):
         options = checked_options(options)
     if stated or members is not None or truth is not None:
         of_truth = {} if truth_covariances is None or truth is not None else {"truth_covariances": truth_covariances}
@@ -298,7 +309,9 @@ def judge(
             require_truth_options(options)
             (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):
-        record = read(record, independent=independent, level=level, gaussian=gaussian, ends=ends)
+        record = read(
+            record, independent=independent, level=level, gaussian=gaussian, ends=ends, alert_limit=alert_limit
+        )
     elif not isinstance(record, Record):
         raise InputError("covariances: needed beside errors, (runs, steps, n, n); or deviations, (runs, steps, n)")
     elif independent:

@@ -19,13 +19,13 @@ from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError
 from consistency.referee.extras import missing, require
 from consistency.referee.pages import verdicts
-from consistency.referee.pages import verdicts as questions_table
 from consistency.referee.pages.ratio_figures import bound_figures, by_axis, ratio_by_group_figure
 from consistency.referee.pages.record_figures import OVER_SIGMA, record_figures
 from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
 from consistency.referee.show import FORMATS, rendered
 from consistency.referee.show.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
 from consistency.referee.system import write_whole
+from consistency.referee.verdicts.tables import region_tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -246,7 +246,8 @@ def compose_files(
         shown: tuple[Block, ...] = *sentence, *at_once, *unfolded
         chapters.append(Chapter(f"estimator-{i}", name, name, shown, _counts(named[name], verdict)))
     blocks = (
-        *verdicts.judgement(study), *verdicts.bounds_tables(study), *questions_table.diagnosis(study), *by_axis(study),
+        *verdicts.judgement(study), *verdicts.bounds_tables(study), *region_tables(judged),
+        *verdicts.diagnosis(study), *by_axis(study),
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].origin.notes))

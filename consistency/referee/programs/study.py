@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.judge_record import judge, looks, progress_text
-from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.planning import Design, sequential_design
 from consistency.referee.diagnostics.record import Record, Skip
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError, naming_arguments
-from consistency.referee.gating.checked_input import planned_dof, rate_shares
+from consistency.referee.gating.checked_input import planned_dof, planned_runs
 from consistency.referee.parsing import one_line
 from consistency.referee.programs.process import (
     OF_A_RUN,
@@ -307,9 +306,9 @@ def _required(plan: ProgramPlan, r: Reading) -> Reading:
         raise InputError("--runs and --until-decided do not go with --each, which has a run for each file")
     if r.conventions.error == GUESS:
         raise InputError(f"--error {GUESS}: goes with 'consistency analyse DIR' when the runs are there")
-    if r.statement.level is not None and not r.statement.gaussian:
-        raise InputError("--level: monte-carlo judges covariances; add --gaussian, or judge bounds of the kept runs "
-                         "with 'consistency analyse'")  # fmt: skip
+    if r.sources.repeats:
+        raise InputError("--truth repeats: monte-carlo takes runs with a truth; put the estimates of all runs into one "
+                         "table, with a column run, for 'consistency analyse TABLE --truth repeats'")  # fmt: skip
     if IS_WINDOWS:
         raise InputError("monte-carlo needs process groups of POSIX; on Windows run it in WSL")
     return checked_options(r)
@@ -460,12 +459,12 @@ class _Loop:
 
     def _plan_runs(self, records: Sequence[Record], stack: ExitStack) -> None:
         """Plan the number of runs, or looks, from the dimension of the first run's errors."""
-        settings, dof = self.plan.settings, min(planned_dof(record) for record in records)
-        rate = settings.false_alarm / max(rate_shares(record) for record in records)
+        settings = self.plan.settings
         self.names = [record.name for record in records]
-        planned = gate_runs(dof, settings.detect, rate, settings.power, settings.allow, settings.lost)
+        planned = max(planned_runs(record, settings, settings.false_alarm) for record in records)
         if self.plan.until_decided:
             _require_looks(records)
+            dof = min(planned_dof(record) for record in records)
             looked: dict[str, Any] = {
                 "dof": dof, "detect": settings.detect, "false_alarm": settings.false_alarm, "power": settings.power,
                 "max_runs": self.plan.max_runs,
@@ -555,12 +554,14 @@ def _require_looks(records: Sequence[Record]) -> None:
     """Refuse records whose verdict has no form for looks at growing numbers of runs."""
     for record in records:
         if (
-            record.errors.parts
+            record.errors.bounds
+            or record.errors.ensemble is not None
+            or record.errors.parts
             or record.runs.independent
             or record.origin.unshown
             or record.truth.covariance is not None
         ):
-            what = "components, windows or a truth that are judged by themselves"
+            what = "bounds, members, components, windows or a truth that are judged by themselves"
             raise InputError(f"--until-decided: {record.name} has {what}; give --runs")
 
 

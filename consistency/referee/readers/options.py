@@ -158,6 +158,7 @@ class StatementOptions:
     level: str | float | Mapping[str, Any] | None = None
     gaussian: bool | None = None
     ends: str | None = None
+    alert_limit: str | float | Mapping[str, Any] | None = None
     dof: int | None = None
     ensemble: int | None = None
     unstated: bool | None = None  # of no command line: the covariance is I where the files state none
@@ -301,6 +302,7 @@ OPTIONS = (  # those that users give, in the order in which the command line sho
         flag="--gaussian/",
     ),
     Option("ends", "'independent': declare that ends of runs and lost runs do not depend on the errors (bounds)."),
+    Option("alert_limit", "Alert limit of protection levels, for shares of the Stanford diagram.", "LIMIT", str),
     Option("by", "Judge groups by this column, too, or since:TOPIC.", "COLUMN"),
     Option("by_file", "Table with that column and t, run or both."),
     Option("bins", "Quantile bins of --by [5], or edges between them (40, is one edge).", "N|A,B,C", _bins),

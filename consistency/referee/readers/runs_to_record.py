@@ -63,6 +63,7 @@ ARRAYS = (
     "path",
     "by",
     "bound_ratios",
+    "regions",
 )  # of a track, as in a record
 UNITS = {"": "step", "s": "s", "m": "m"}
 FORMS = "a whole number of steps (100), seconds (10s) or metres along the true path (50m)"
@@ -90,6 +91,7 @@ class Track:
     path: Array | None = None  # (k, 2, 2 or 3), m, true and estimated positions
     by: Array | None = None  # (k,), values of the column that makes groups
     bound_ratios: Array | None = None  # (k, bounds), errors over their bounds
+    regions: Array | None = None  # (k, bounds), of the Stanford diagram
 
     def part(self, index: Sequence[int]) -> Track:
         assert self.error is not None
@@ -181,6 +183,7 @@ def assemble(
             axes,
             convention=convention,
             bound_ratios=arrays["bound_ratios"],
+            regions=arrays["regions"],
         ),
         InnovationRecord(arrays["nis"], arrays["nis_dof"]),
         Runs(numbers, t=t, times=arrays["t"], by=arrays["by"]),

@@ -10,20 +10,20 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, RunSummary, compare, summary
+from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, RunSummary, compare, summary_of
 from consistency.referee.diagnostics.record import Record, Skip, numbered_axes
 from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
+from consistency.referee.readers.options import REPEATS, SourceOptions
 from consistency.referee.show.blocks import Block, Document, Text
 from consistency.referee.system import SCHEMA_VERSION, manifest_of, write_whole, writing
-from consistency.referee.types import Array
 from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
 from consistency.referee.verdicts.tables import comparison_table
 
@@ -182,6 +182,8 @@ def _compared(
     except ValueError as error:
         raise InputError(f"{of_a} against {of_b}: {error}") from None
     failures = FailedRuns(a.failures[of_a], b.failures[of_b])
+    if kind := a.filters[of_a].kind:
+        note = f"{note}. Both are {kind}".removeprefix(". ")
     return Compared(of_a, of_b, comparison, failures, note, same_runs, (a.name, b.name))
 
 
@@ -245,7 +247,8 @@ def baseline(
         record = source.record(each).without_first(first)
         if record.errors.bounds:
             raise InputError(
-                f"{record.name}: bounds are judged by 'analyse'; with --gaussian they are read as covariances"
+                f"{record.name}: bounds are not compared: 'analyse' finds the factor of each estimator, with its "
+                "interval; with --gaussian bounds are read as covariances, which are"
             )
         if record.errors.nees is None:
             raise InputError(f"{name}: has no truth of {each}; give it with --truth, as only a NEES can be compared")
@@ -255,11 +258,11 @@ def baseline(
         own = record
         if not record.origin.unshown:
             own = record.as_runs
-        world = own.in_world.errors
-        nees = cast(Array, own.errors.nees)
-        filters[each] = summary(nees, own.errors.dof, world.error, world.covariance, own.run_numbers)
+        filters[each] = summary_of(own)
     trials = source.trials
-    if truth is not None:
+    if SourceOptions(truth=truth).repeats:
+        trials = (REPEATS, None)  # runs of one number are taken as one trial
+    elif truth is not None:
         trials = (_digest(truth), None)
     return Baseline(name, source.scenario, trials, filters, failures, axes, _option(first), of_runs)
 
@@ -298,6 +301,8 @@ def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:
     filters = {}
     for name, rows in base.filters.items():
         filters[name] = plain(vars(rows)) | {"failures": base.failures[name], "axes": list(base.axes[name])}
+        if not rows.kind:
+            del filters[name]["kind"]
     data = manifest_of(
         kind="baseline",
         scenario=base.scenario,
@@ -385,7 +390,7 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
         raise ValueError(f"key '{place}': not a table")
     if missing := [key for key in FILTER_KEYS if key not in table]:
         raise ValueError(f"key '{place}.{missing[0]}': missing")
-    if unknown := [key for key in table if key not in (*FILTER_KEYS, "axes")]:  # files written before lack axes
+    if unknown := [key for key in table if key not in (*FILTER_KEYS, "axes", "kind")]:  # files written before lack axes
         raise ValueError(f"key '{place}.{unknown[0]}': unknown")
     runs = _list(table["runs"], f"{place}.runs")
     for k, run in enumerate(runs):
@@ -405,7 +410,10 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     if axes == [f"e{i + 1}" for i in range(len(axes))]:  # of components without names, in files written before
         axes = list(numbered_axes(len(axes)))
     failures = _whole(table["failures"], f"{place}.failures", 0)
-    return RunSummary(np.array(runs, np.int64), dof, *parts), failures, tuple(axes)
+    kind = table.get("kind", "")
+    if not isinstance(kind, str):
+        raise ValueError(f"key '{place}.kind': not a text")
+    return RunSummary(np.array(runs, np.int64), dof, *parts, kind), failures, tuple(axes)
 
 
 def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:

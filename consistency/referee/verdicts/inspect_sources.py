@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.number_words import percent, plural, short
@@ -56,7 +57,8 @@ QUALITY = re.compile(
 COUNTED = ("run", "step", "filter", "nees", "nis", "nis_dof", *CLOCKS)  # columns beside the state
 ADVICE = re.compile(r"\badd (--[a-z-]+) ([^\s;()]+)")  # in a note of a reader
 OF_DRIVES = {"truth", "topic", "truth_topic", "columns", "truth_columns"}  # options of 'fit-covariance', too
-FAR, DRIFTS = 4, 2.0  # rows, and growth of squared differences from which errors are taken to last, as of odometry
+FEWEST_ROWS = 30  # below, correlated rows and independent ones look alike
+CORRELATED = 0.01  # false-alarm rate at which neighbouring rows are found to be correlated
 DEEPEST, MOST = 4, 4  # options that are added one after the other; candidates for one of them
 LARGE = 1e6  # a variance from which on it says that nothing is known
 UNLIKE = 100.0  # ratio of two deviations of one unit
@@ -359,8 +361,11 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
             facts = (*facts, *Attempt(r, {}, found).facts)
             rows = _attempt(path, r.with_options(unstated=True, independent=True), {})
             if not rows.refusal and all(map(_is_of_rows, _attempt(path, r.with_options(unstated=True), {}).records)):
-                why.append(("--independent", "errors of neighbouring rows differ as much as those of rows far apart"))
+                why.append(
+                    ("--independent", "no correlation of neighbouring rows is found, at a false-alarm rate of 1 %")
+                )
                 note = f"{tried.refusal}; if the estimator has one, write it; 'correct' finds one, judged row by row"
+                note += f". If rows are poses of a drive: {_command('fit-covariance', path, r, ('--span', '1m'))}"
                 command = _command("correct", path, r.with_options(independent=True))
                 return Inspection(path, kind.name, facts, (note,), tuple(why), command)
             why.append(("--span", "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"))
@@ -378,12 +383,19 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
 
 
 def _is_of_rows(record: Record) -> bool:
-    """Whether errors of rows are independent, as of detections: hardly farther apart over four rows than over one."""
+    """Whether errors of rows may be independent, as of detections: no correlation of neighbours is found.
+
+    The sum of their products is compared with the root of that of the squared products, so that errors of any size in
+    each row keep the rate, which all components share.
+    """
     e = record.errors.error
-    if e is None or e.shape[1] <= FAR:
+    if e is None or np.isfinite(e).all(axis=-1).sum() < FEWEST_ROWS:
         return False
-    near, far = (np.nanmean(np.square(e[:, rows:] - e[:, :-rows]), axis=(0, 1)) for rows in (1, FAR))
-    return bool((far < DRIFTS * near).all())
+    centred = e - np.nanmean(e, axis=1, keepdims=True)
+    products = centred[:, 1:] * centred[:, :-1]
+    with np.errstate(invalid="ignore"):
+        z = np.nansum(products, axis=(0, 1)) / np.sqrt(np.nansum(np.square(products), axis=(0, 1)))
+    return bool((z < -special.ndtri(CORRELATED / e.shape[-1])).all())
 
 
 def _innovations(path: Path, r: Reading, kind: str, facts: Pairs = (), choice: Mapping[str, Any] = {}) -> Inspection:

@@ -26,7 +26,7 @@ from consistency.referee.diagnostics.number_words import (
 from consistency.referee.diagnostics.sentences import question_text
 from consistency.referee.diagnostics.status import axis_at_fault
 from consistency.referee.diagnostics.verdict import MapScore, Verdict
-from consistency.referee.diagnostics.verdict_parts import Interval, RejectionScore
+from consistency.referee.diagnostics.verdict_parts import REGIONS, Interval, RejectionScore
 from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.show.blocks import (
     NONE,
@@ -63,6 +63,10 @@ MAP_COLUMNS = (
     Column("Runs", number=True),
     Column("Landmarks", number=True),
     Column("Landmarks left out", "Landmarks\nleft out", number=True),
+)
+REGION_COLUMNS = (
+    Column("of the steps, %", width="2fr"),
+    *(Column(head, number=True) for head in ("alert limit", *REGIONS)),
 )
 REJECTION_COLUMNS = (
     Column("Observations", number=True),
@@ -312,6 +316,7 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
     if reasons:
         blocks.append(Reasons(tuple(reason(v, name, verbose=verbose) for name, v in verdicts.items())))
+        blocks += region_tables(verdicts)
     return Document(title, "", (), tuple(blocks), dict(verdicts))
 
 
@@ -345,6 +350,21 @@ def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
         each, some = f"{max(rates):g}", f"{min(1.0, sum(rates)):.2g}"
         lines.append(f"false alarm {each} holds for each filter; for all {len(rates)} together it is at most {some}")
     return lines
+
+
+def region_tables(verdicts: Mapping[str, Verdict]) -> list[Block]:
+    """Shares of the steps (%) in the regions of the Stanford diagram, a table for each estimator with alert limits."""
+    tables: list[Block] = []
+    for name, v in verdicts.items():
+        rows: list[tuple[Cell, ...]] = [
+            (score.name, short(score.alerts.limit), *(Quantity(100.0 * s, digits=".3g") for s in score.alerts.shares))
+            for score in v.bounds
+            if score.alerts is not None
+        ]
+        if rows:
+            label = f"Regions of the Stanford diagram of {name}"
+            tables.append(table(REGION_COLUMNS, rows, label, caption=f"{label}: share of the steps (%)."))
+    return tables
 
 
 def comparison_table(a: str, b: str, c: Comparison) -> Table:

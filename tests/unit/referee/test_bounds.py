@@ -23,7 +23,7 @@ from consistency.referee.diagnostics.exceedance import (
 )
 from consistency.referee.diagnostics.record import Bound, Errors, Record, skip_of
 from consistency.referee.diagnostics.verdict import plain
-from consistency.referee.readers.formats.bounds import Levels, bound_columns, level_of_text
+from consistency.referee.readers.formats.bounds import bound_columns, level_of_text, levels_of
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent
 
 
@@ -405,7 +405,7 @@ def test_levels_are_read(text, share, dimensions):
     level = level_of_text(text)
     assert_allclose(level.of(dimensions), share, rtol=1e-4)
     assert_allclose(level_of(level.in_deviations(dimensions), dimensions), share, rtol=1e-4)
-    assert Levels(f"a={text},b=1%").of("a") == level
+    assert levels_of(f"a={text},b=1%").of("a") == level
     assert_allclose(level_of_text("2sigma").of(2), 0.8647, rtol=1e-4)
 
 
@@ -453,6 +453,27 @@ def test_bad_bounds_are_refused_in_one_sentence(tmp_path, capsys, columns, words
         assert part in err
 
 
+@pytest.mark.parametrize(
+    ("name", "words", "parts"),
+    [
+        ("est.tum", "--level 95%", ("--level: does not go with", "covariances alone", "radius_x_y", ".npz")),
+        ("est.tum", "--level 95% --alert-limit 4", ("--level", "table")),
+        ("est.tum", "--members x=e*", ("--members", "columns of --members")),
+        ("est.bag", "--level 95%", ("--level", "radius_x_y")),
+        ("log.ulg", "--level 95%", ("flight logs", "eph", "radius_x_y with --level")),
+        ("log.bin", "--level 95%", ("flight logs", "eph", "radius_x_y with --level")),
+    ],
+)
+def test_files_that_hold_no_bounds_name_the_way(tmp_path, capsys, name, words, parts):
+    rows = "".join(f"{k / 10} {k} 0 0 0 0 0 1\n" for k in range(40))
+    for file in (name, "truth.tum"):
+        (tmp_path / file).write_bytes(b"#ROSBAG V2.0\n" if file.endswith(".bag") else rows.encode())
+    truth = () if name.endswith((".ulg", ".bin", ".bag")) else ("--truth", tmp_path / "truth.tum")
+    err = refused(capsys, "analyse", tmp_path / name, *truth, *words.split())
+    for part in parts:
+        assert part in err
+
+
 def test_bad_arrays_are_refused():
     e, bounds = errors(5), np.ones((5, 40, 1))
     with pytest.raises(cs.InputError, match=r"bounds need their level"):
@@ -471,10 +492,106 @@ def test_bad_arrays_are_refused():
 
 def test_commands_for_covariances_refuse_bounds(tmp_path, capsys):
     path = table(tmp_path / "est.csv", lambda x, y: {"bound_x": 2.0})
-    program = ("--out", tmp_path / "o", "--", "true")
     for words in (("baseline", path, "--out", tmp_path / "b.json"), ("compare", path, path)):
         assert "--gaussian" in refused(capsys, *words, "--level", "95%")
-    assert "--gaussian" in refused(capsys, "monte-carlo", "--level", "95%", *program)
+
+
+# --- alert limits ------------------------------------------------------------------------------------------------
+
+
+def test_steps_are_in_the_regions_of_the_stanford_diagram():
+    """Errors and bounds in each region beside an alert limit of 10, some a hair from its edges."""
+    steps = {  # error, bound
+        "nominal operation": [(0, 0), (3, 4), (4, 4), (10, 10)],
+        "misleading": [(4.1, 4), (10, 9.9)],
+        "hazardously misleading": [(10.1, 4), (10.1, 10), (99, 1)],
+        "unavailable": [(3, 11), (10.5, 10.5)],
+        "unavailable and misleading": [(12, 11)],
+    }
+    e, b = np.array([pair for pairs in steps.values() for pair in pairs], float).T
+    verdict = cs.judge(np.stack([e, -e])[..., None], bounds=np.stack([b, b])[..., None], level=0.5, alert_limit=10)
+    (score,) = verdict.bounds
+    shares = verdict.as_dictionary()["statistics"]["bounds"][0]["alerts"]["shares"]
+    assert shares == pytest.approx({name: len(pairs) / len(e) for name, pairs in steps.items()})
+    outside = sum(share for name, share in shares.items() if "misleading" in name)
+    assert outside == pytest.approx(score.rate)
+
+
+def test_the_longer_side_of_an_interval_alerts_and_runs_are_weighed_alike(tmp_path):
+    def of(x, y):
+        return {"x_low": x - np.where(np.arange(10) < 5, 30.0, 8.0), "x_high": x + 9.0, "y_low": y, "y_high": y + 1.0}
+
+    path = table(tmp_path / "est.csv", of, runs=4)
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(row for row in rows if not row.startswith("0.0,") or float(row.split(",")[1]) > 5) + "\n")
+    x, y = cs.judge(cs.read(path, level="95%", alert_limit={"x_low": 20.0, "y_high": 2})).bounds
+    unavailable = np.mean([0.0, 0.5, 0.5, 0.5])
+    assert x.alerts.shares == (1.0 - unavailable, 0, 0, unavailable, 0)
+    assert x.alerts.limit == 20.0
+    assert y.alerts.shares[3:] == (0, 0)
+    assert sum(y.alerts.shares[1:]) == pytest.approx(y.rate)
+    only_x = cs.judge(cs.read(path, level="95%", alert_limit={"x_low": 20.0})).bounds
+    assert [one.alerts is None for one in only_x] == [False, True]
+
+
+def test_an_excluded_rate_of_hazards_counts_missing_steps_and_is_three_over_runs():
+    e, bounds = errors(100), np.full((100, 40, 1), 5.0)
+    alerts = cs.judge(e, bounds=bounds, level=0.95, alert_limit=6.0).bounds[0].alerts
+    assert alerts.shares == (1, 0, 0, 0, 0)
+    assert alerts.hazard_limit == pytest.approx(1.0 - 0.05 ** (1 / 100), rel=1e-3)  # 3 / N
+    (line,) = [one for one in cs.judge(e, bounds=bounds, level=0.95, alert_limit=6).reasons if "alert limit" in one]
+    for part in ("in 0 % of the steps", "3 % or more is excluded", "100 runs never show a rate below 3 %", "1e-7"):
+        assert part in line
+    e[:10, 30:] = np.nan
+    ended = cs.judge(e, bounds=bounds, level=0.95, alert_limit=6.0).bounds[0].alerts
+    assert ended.hazard_limit > alerts.hazard_limit + 0.02
+    declared = cs.judge(e, bounds=bounds, level=0.95, alert_limit=6.0, ends="independent").bounds[0].alerts
+    assert declared.hazard_limit == pytest.approx(alerts.hazard_limit)
+
+
+def test_groups_and_first_steps_have_regions_of_their_own():
+    e, bounds = errors(60), np.where(np.arange(40)[None, :, None] < 10, 9.0, 2.0) * np.ones((60, 40, 1))
+    by = {"part": np.where(np.arange(40) < 10, "first", "last")[None].repeat(60, axis=0)}
+    scores = cs.judge(e, bounds=bounds, level=0.95, alert_limit=5.0, by=by).bounds
+    assert [one.alerts.shares[3] for one in scores] == [0.25, 1.0, 0.0]
+    later = cs.judge(e, bounds=bounds, level=0.95, alert_limit=5.0, skip="10").bounds
+    assert later[0].alerts.shares[3] == 0.0
+    rows = cs.judge(e[:, :, :], bounds=bounds, level=0.95, alert_limit=5.0, independent=True).bounds
+    assert (rows[0].alerts.shares[3], rows[0].runs) == (0.25, 2400)
+
+
+def test_a_table_of_the_regions_is_printed_and_on_the_page(tmp_path, capsys):
+    path = table(tmp_path / "est.csv", lambda x, y: {"HPL": np.where(np.arange(10) < 2, 50.0, 2.4477)})
+    words = ("--columns", "radius_x_y=HPL", "--state", "x,y", "--level", "95%", "--alert-limit", "radius_x_y=40")
+    out, _ = consistency(capsys, "analyse", path, *words, "--report", tmp_path / "report")
+    (row,) = [line.split() for line in out.splitlines() if line.startswith("radius_x_y ")]
+    assert row[1] == "40.0"
+    assert float(row[5]) == 20.0
+    assert sum(map(float, row[2:])) == pytest.approx(100.0, abs=0.1)
+    html = (tmp_path / "report/report.html").read_text()
+    assert "Stanford" in html
+    assert "hazardously misleading" in html
+    _, bounds = analysed(capsys, path, *words)
+    assert bounds[0]["alerts"]["shares"]["unavailable"] == pytest.approx(0.2)
+    assert "alerts" not in str(analysed(capsys, path, *words[:-2])[1][0].get("alerts") or "")
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("--level 95% --alert-limit 0", ("--alert-limit 0", "above 0")),
+        ("--level 95% --alert-limit bound_x=-4", ("--alert-limit -4", "above 0")),
+        ("--level 95% --alert-limit nan", ("--alert-limit nan", "above 0")),
+        ("--level 95% --alert-limit high", ("--alert-limit high", "above 0")),
+        ("--level 95% --alert-limit bound_y=4", ("--alert-limit bound_y", "there are: bound_x")),
+        ("--level 95% --gaussian --alert-limit 4", ("--alert-limit", "--gaussian")),
+        ("--alert-limit 4", ("--alert-limit", "--level 95%")),
+    ],
+)
+def test_bad_alert_limits_are_refused(tmp_path, capsys, words, parts):
+    err = refused(capsys, "analyse", table(tmp_path / "est.csv", lambda x, y: {"bound_x": 1.0}, 3), *words.split())
+    for part in parts:
+        assert part in err
 
 
 # --- gates, plan, reports ------------------------------------------------------------------------------------------

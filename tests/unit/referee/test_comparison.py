@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import consistency
+from command import consistency, refused
 from numpy.testing import assert_allclose
 from recorded import read_recordings
 from scipy import optimize, special, stats
@@ -15,6 +15,7 @@ from scipy import optimize, special, stats
 import consistency as cs
 from consistency.bench.runs.results_to_records import results_source
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
+from consistency.referee.diagnostics.comparison import summary_of
 from consistency.referee.diagnostics.nees import Contrast, contrast, margin
 from consistency.referee.gating.session import RunningTest, needed_at, watching
 from consistency.referee.verdicts.compare_sources import (
@@ -25,7 +26,7 @@ from consistency.referee.verdicts.compare_sources import (
     read_baseline,
     write_baseline,
 )
-from consistency.testing import InsufficientTrials, assert_not_worse
+from consistency.testing import ConsistencyError, InsufficientTrials, assert_not_worse
 
 RATE = 1e-5  # false-failure rate of each statistical assertion below
 
@@ -371,7 +372,7 @@ def test_the_end_of_a_session_plans_as_the_gate_did(rng):
         with watching(RunningTest(keep=entries.append)):
             c = assert_not_worse(nees_a=scale * a[:, None], nees_b=scale * b[:, None], dof=1, false_alarm=1e-9)
         assert needed_at(entries[-1], 1e-9) == entries[-1].needed == c.needed_runs()
-        assert needed_at(replace(entries[-1], detect=1.01), 1e-9) == c.needed_runs(1.01)
+        assert needed_at(replace(entries[-1], planned_detect=1.01), 1e-9) == c.needed_runs(1.01)
 
 
 # --- results and files -----------------------------------------------------------------------------
@@ -454,3 +455,112 @@ def test_files_of_one_name_are_told_apart_by_their_paths(tmp_path, capsys, monke
     assert {"RMSE x (m)", "RMSE heading (rad)"} <= {line.split("  ")[0] for line in shown.splitlines()}
     same, _ = consistency(capsys, "compare", files[0], files[0], "--truth", tmp_path / "truth.csv")
     assert "than the reference" in same
+
+
+# --- what else may be stated -------------------------------------------------------------------------------------
+
+
+def members(rng, m, ratio=1.0, runs=60, steps=4):
+    """Truth (runs, steps, 2) and members (runs, steps, m, 2), the truth with ``ratio`` times their variance."""
+    return np.sqrt(ratio) * rng.standard_normal((runs, steps, 2)), rng.standard_normal((runs, steps, m, 2))
+
+
+def members_table(path, m, ratio=1.0, seed=0, runs=40):
+    truth, draws = members(np.random.default_rng(seed), m, ratio, runs)
+    rows = [",".join(["run", "step", "true_x", *(f"ex{i}" for i in range(m))])]
+    for run, step in np.ndindex(truth.shape[:2]):
+        rows.append(",".join(map(str, [run, step, truth[run, step, 0], *draws[run, step, :, 0]])))
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_members_are_compared_as_numbers_of_one_kind(tmp_path, capsys):
+    """Truth of 4 times the variance: that they are not found worse has a probability below 1e-6."""
+    a, b, few = (tmp_path / name for name in ("a.csv", "b.csv", "few.csv"))
+    for path, m, ratio in ((a, 20, 4.0), (b, 20, 1.0), (few, 10, 1.0)):
+        members_table(path, m, ratio)
+    given = ("--members", "x=ex*")
+    (found,) = json.loads(consistency(capsys, "compare", a, b, *given, "--json")[0])
+    assert found["worse"]
+    assert [d["name"] for d in found["differences"]] == ["ANEES"]  # their RMSE has no unit
+    kind = found["sentence"].partition("Both are ")[2]
+    shown = summary_of(cs.read(a, members={"x": "ex*"})).kind
+    assert kind == shown
+    assert "numbers of 20 members" in kind
+    assert float(kind.split()[-1]) == pytest.approx(1.55, abs=0.25)  # of 2, less
+    consistency(capsys, "baseline", b, *given, "--out", tmp_path / "b.json")
+    stored = json.loads(consistency(capsys, "compare", a, tmp_path / "b.json", *given, "--json")[0])
+    assert stored[0]["distance"] == pytest.approx(found["distance"])
+    err = refused(capsys, "compare", few, tmp_path / "b.json", *given)
+    assert "10 members" in err
+    assert "20 members" in err
+    damaged = (tmp_path / "b.json").read_text().replace('"kind": "numbers', '"kind": 3, "x": "numbers')
+    (tmp_path / "bad.json").write_text(damaged)
+    assert "bad.json" in refused(capsys, "compare", a, tmp_path / "bad.json", *given)
+
+
+def test_a_baseline_of_covariances_has_no_kind(results, tmp_path):
+    write_baseline(baseline(results_source(results)), tmp_path / "base.json")
+    assert "kind" not in (tmp_path / "base.json").read_text().replace('"kind": "baseline"', "")
+
+
+def test_the_gate_compares_members_ensembles_repeats_and_rows():
+    """At a false-alarm rate of 1e-6; a right candidate is found worse with that probability."""
+    rng = np.random.default_rng(4)
+    truth, draws = members(rng, 20)
+    options = {"false_alarm": 1e-6, "detect": 6.0}
+    assert not assert_not_worse(members_a=draws, members_b=draws, truth=truth, **options).worse
+    with pytest.raises(ConsistencyError, match="worse"):
+        assert_not_worse(members_a=draws / 4, members_b=draws, truth=truth, **options)
+    with pytest.raises(ValueError, match=r"20 members.*10 members"):
+        assert_not_worse(members_a=draws, members_b=draws[:, :, :10], truth=truth, **options)
+    mean = draws.mean(axis=2, keepdims=True)
+    P = np.swapaxes(draws - mean, 2, 3) @ (draws - mean) / 19
+    e = truth - mean[:, :, 0]
+    assert not assert_not_worse(e, P, e, P, ensemble=20, **options).worse
+    with pytest.raises(ConsistencyError, match="worse"):
+        assert_not_worse(e, P / 16, e, P, ensemble=20, **options)
+    x = rng.standard_normal((80, 3))
+    P = np.broadcast_to(np.eye(3), (80, 3, 3))
+    assert assert_not_worse(x, P, x, P, independent=True, **options).runs == 80
+    of_repeats = {"truth": "repeats", "independent": True}
+    assert assert_not_worse(x + 7.0, P, x - 3.0, P, **of_repeats, **options).runs == 79
+    with pytest.raises(ConsistencyError, match="worse"):
+        assert_not_worse(x, P / 16, x, P, **of_repeats, **options)
+    with pytest.raises(ValueError, match="members"):
+        assert_not_worse(cs.run_trials, filter="a", members_a=draws)
+
+
+def test_runs_of_members_are_planned_by_what_their_numbers_show():
+    """A ratio of 1.5 shows as less in ranks among 4 members, and takes more runs than that of a covariance."""
+    truth, draws = members(np.random.default_rng(5), 4)
+    entries = []
+    with watching(RunningTest(keep=entries.append)), pytest.raises(InsufficientTrials) as found:
+        assert_not_worse(members_a=draws, members_b=-draws, truth=truth, false_alarm=1e-6, detect=1.5)
+    sides = (
+        summary_of(cs.judge(members=draws, truth=truth).record),
+        summary_of(cs.judge(members=-draws, truth=truth).record),
+    )
+    assert found.value.needed > 1.3 * compare(*sides, 1e-6).needed_runs(1.5, 0.95)
+
+
+def test_repeats_are_compared_run_by_run(tmp_path, capsys):
+    rng = np.random.default_rng(6)
+    paths = []
+    for name, size in (("a.csv", 1.0), ("b.csv", 5.0)):
+        rows = ["run,step,x,P_x_x", *(f"{run},1,{size * rng.standard_normal()},1" for run in range(60))]
+        (tmp_path / name).write_text("\n".join(rows) + "\n")
+        paths.append(tmp_path / name)
+    words = ("--truth", "repeats", "--state", "x", "--json")
+    (found,) = json.loads(consistency(capsys, "compare", *paths, *words)[0])
+    assert (found["runs"], found["paired"], found["worse"]) == (59, True, False)
+    assert json.loads(consistency(capsys, "compare", *paths[::-1], *words)[0])[0]["worse"]
+
+
+def test_bounds_are_not_compared(tmp_path, capsys):
+    path = tmp_path / "a.csv"
+    path.write_text("run,step,x,true_x,bound_x\n" + "\n".join(f"{run},1,{run % 3},1,2" for run in range(30)) + "\n")
+    err = refused(capsys, "compare", path, path, "--level", "95%")
+    for part in ("bounds are not compared", "'analyse'", "--gaussian"):
+        assert part in err
+    assert "ANEES" in consistency(capsys, "compare", path, path, "--level", "95%", "--gaussian")[0]

@@ -137,6 +137,82 @@ def test_groups_have_factors_of_their_own(tmp_path, capsys):
     assert found.rates["bound_x"].value == pytest.approx((expected > 1).mean())
 
 
+def test_tables_are_written_with_corrected_bounds(tmp_path, capsys):
+    """Radius, interval and bound, named by --columns: what analyse reads of each table is what correct said of it."""
+    rng = np.random.default_rng(9)
+    rows = ["run;t;x;y;z;true_x;true_y;true_z;h_acc;lo;x_high;bound_z;z_low;z_high;light"]
+    for run in range(1, 41):
+        for k in range(4):
+            x, y, z = rng.normal(size=3) * (1.0 + k)
+            cells = [run, k, x, y, z, 0, 0, 0, 2.0, x - 1.5, x + 2.5, 1.5, z - 1, z + 1, "light" if k < 2 else "dark"]
+            rows.append(";".join(map(str, cells)))
+    path = tmp_path / "est.csv"
+    path.write_text("# a receiver\n" + "\n".join(rows) + "\n")
+    words = ("--state", "x,y,z", "--columns", "radius_x_y=h_acc,x_low=lo", "--level", "80%", "--by", "light")
+    out, _ = consistency(capsys, "correct", path, *words, "--out", tmp_path / "c")
+    assert str(tmp_path / "c/held-out/est.csv") in out
+    columns = {"radius_x_y": "h_acc", "x_low": "lo"}
+    options = {"state": ["x", "y", "z"], "columns": columns, "level": "80%", "by": "light"}
+    stated = cs.read(path, **options)
+    found = cs.correct(stated)
+    places = [stated.groups.names.index("light is light"), stated.groups.names.index("light is dark")]
+    assert np.unique(stated.groups.index).tolist() == sorted(places)
+    for name, factors in (("corrected", lambda of: of.factor), ("held-out", lambda of: of.left_out[:, None])):
+        text = (tmp_path / "c" / name / "est.csv").read_text()
+        assert text.splitlines()[:2] == path.read_text().splitlines()[:2]
+        restated = cs.read(tmp_path / "c" / name / "est.csv", **options).errors.bound_ratios
+        for b, bound in enumerate(stated.errors.bounds):
+            for of in found.factors:
+                if of.bound == bound and of.group:
+                    own = stated.groups.index == stated.groups.names.index(of.group)
+                    expected = stated.errors.bound_ratios[..., b] / factors(of)
+                    np.testing.assert_allclose(restated[..., b][own], expected[own], rtol=1e-9)
+    judged = cs.judge(cs.read(tmp_path / "c/held-out/est.csv", **options)).bounds
+    assert judged[0].rate == pytest.approx(found.rates[judged[0].name].value)
+
+
+def test_an_interval_without_an_estimate_is_written_about_its_middle(tmp_path, capsys):
+    path = tmp_path / "hub.csv"
+    rows = [f"{run},1,{run % 7 - 3},{-1.0 - run % 2},{1.0 + run % 2}" for run in range(60)]
+    path.write_text("\n".join(["run,step,true_x,x_low,x_high", *rows]) + "\n")
+    consistency(capsys, "correct", path, "--level", "60%", "--out", tmp_path / "c", "--held-out", "half")
+    (factor,) = tomllib.loads((tmp_path / "c/correction.toml").read_text())["factors"]
+    low, high = np.loadtxt(tmp_path / "c/corrected/hub.csv", delimiter=",", skiprows=1)[:, 3:].T
+    size = factor["factor"] * (1.0 + np.arange(60) % 2)
+    np.testing.assert_allclose([low, high], [-size, size])
+    held_out = np.loadtxt(tmp_path / "c/held-out/hub.csv", delimiter=",", skiprows=1)
+    assert held_out[:, 0].tolist() == list(range(30, 60))
+    np.testing.assert_allclose(held_out[:, 4], size[30:])
+
+
+def test_rows_and_archives_are_not_told_apart_in_a_file(tmp_path, capsys):
+    """Rows have corrected bounds alone; an archive has factors alone; groups of a file beside write no table."""
+    path = tmp_path / "est.csv"
+    path.write_text("\n".join(["t,x,true_x,bound_x", *(f"{k},{k % 5 - 2},0,1.0" for k in range(80))]) + "\n")
+    words = ("correct", path, "--level", "80%", "--independent", "--state", "x", "--anyway", "--out")
+    out, _ = consistency(capsys, *words, tmp_path / "c")
+    assert "corrected/est.csv" in out
+    assert "held-out/" not in out
+    (factor,) = tomllib.loads((tmp_path / "c/correction.toml").read_text())["factors"]
+    bound = np.loadtxt(tmp_path / "c/corrected/est.csv", delimiter=",", skiprows=1)[:, 3]
+    np.testing.assert_allclose(bound, factor["factor"])
+    (tmp_path / "by.csv").write_text("t,light\n" + "\n".join(f"{k},{'ab'[k % 2]}" for k in range(80)) + "\n")
+    by = ("--by", "light", "--by-file", tmp_path / "by.csv")
+    assert "corrected/est.csv" not in consistency(capsys, *words, tmp_path / "d", *by)[0]
+    e, bounds = drawn(60)
+    np.savez(tmp_path / "est.npz", errors=e, bounds=bounds)
+    out, _ = consistency(capsys, "correct", tmp_path / "est.npz", "--level", "90%", "--anyway", "--out", tmp_path / "n")
+    assert "corrected/" not in out
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    for run in range(30):
+        (folder / f"{run:02d}.csv").write_text(f"t,x,true_x,radius_x\n0,{run / 9},0,1.0\n1,{run % 3},0,2.0\n")
+    consistency(capsys, "correct", folder, "--level", "80%", "--state", "x", "--anyway", "--out", tmp_path / "f")
+    read = cs.read(tmp_path / "f/held-out", level="80%", state=["x"])
+    found = cs.correct(cs.read(folder, level="80%", state=["x"]))
+    assert np.mean(np.abs(read.errors.bound_ratios) > 1) == pytest.approx(found.rates["radius_x"].value)
+
+
 def test_a_stated_bound_is_not_taken_for_nothing(tmp_path, capsys):
     out, notes = consistency(capsys, "correct", table(tmp_path / "est.csv"), "--level", "90%")
     assert "states no covariance" not in notes

@@ -17,10 +17,11 @@ from test_dataflash import flight
 from test_fixes import PLACE, STEPS, solution
 
 import consistency as cs
+from consistency.referee.diagnostics.record import Errors, Record
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.kitti_files import read_drive
 from consistency.referee.readers.options import make_reading
-from consistency.referee.verdicts.inspect_sources import _command
+from consistency.referee.verdicts.inspect_sources import _command, _is_of_rows
 
 RUNS, ROWS = 6, 40
 
@@ -287,6 +288,44 @@ def test_poses_without_covariances_get_the_command_that_fits_them(tmp_path, caps
     assert "none is stated" in out
     if not drifts:
         consistency(capsys, *shlex.split(out.splitlines()[-1])[1:])  # runs as it stands
+        assert "consistency fit-covariance" in out  # what drives take is named, too
+
+
+def autoregression(rng, rows, components, phi):
+    """Errors of a run (1, rows, components) in which neighbours are correlated by ``phi``; 1 is a constant."""
+    e = rng.standard_normal((rows, components))
+    for k in range(1, rows):
+        e[k] = phi * e[k - 1] + np.sqrt(1.0 - phi**2) * e[k]
+    return e[None]
+
+
+@pytest.mark.parametrize("rows", [30, 200, 1000])
+@pytest.mark.parametrize("components", [1, 6])
+def test_independent_rows_are_told_at_a_stated_rate(rows, components):
+    """Of 200 files of independent rows 1 % may be missed, and 13 are by chance with 1e-7; drives are not told so."""
+    rng = np.random.default_rng([rows, components])
+    sizes = np.exp(np.arange(rows) // (rows // 3))[None, :, None]  # near tags, then far ones
+
+    def told(phi, sizes=1.0, rows=rows):
+        records = (Record("e", Errors(sizes * autoregression(rng, rows, components, phi))) for _ in range(200))
+        return sum(map(_is_of_rows, records))
+
+    assert told(0.0) >= 188
+    assert told(0.0, sizes) >= 188
+    assert told(1.0) == 0
+    most = 40 if rows == 30 else 0  # of 30 rows with one component 7 % are not told: 40 by chance with 1e-7
+    assert told(0.9) <= most
+    assert told(0.99) <= most
+    assert told(0.0, rows=29) == 0
+
+
+def test_rows_of_several_runs_and_unknown_ones_are_told():
+    rng = np.random.default_rng(3)
+    e = rng.standard_normal((40, 5, 2)) + 9.0 * rng.standard_normal((40, 1, 2))
+    e[::7, 2] = np.nan
+    assert _is_of_rows(Record("e", Errors(e)))
+    e[..., 1] = e[:, :1, 1] + np.arange(5)
+    assert not _is_of_rows(Record("e", Errors(e)))
 
 
 def test_covariances_that_are_no_filters_are_named(tmp_path):

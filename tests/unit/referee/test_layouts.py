@@ -682,7 +682,7 @@ def test_a_lower_triangle_is_a_covariance(heading, inside):
             r"o\.csv, line 2: column 't': not a number with a decimal point",
         ),
         ("o.txt.gz", "", "", r"o\.txt\.gz: unknown kind of file; .*; unpack it$"),
-        ("f.ulg", "", "", r"f\.ulg: unknown kind of file; .*; flight logs are for 'consistency monitor'$"),
+        ("f.ulg", "", "", r"f\.ulg: unknown kind of file; .*; flight logs are for 'consistency monitor'; .*level=$"),
         (
             "d/0.csv",
             "t,x,y,heading",

@@ -16,6 +16,8 @@ from programs import COPY, STEPS, script, write_tables
 
 import consistency as cs
 from consistency.commands import main
+from consistency.referee.diagnostics.exceedance import runs_to_show
+from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.errors import InputError
 from consistency.referee.programs.process import LARGEST_SEED, Processes, program_of, run_program, seed_of
 from consistency.referee.readers.pipeline.program_runs import filled
@@ -572,6 +574,73 @@ def test_files_of_sound_runs_are_deleted(place, capsys):
     status, _, err = consistency("analyse", "out", "--error", "vector", capsys=capsys)
     assert status == 2
     assert "--keep failed" in err
+
+
+# --- other statements --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stated(place):
+    """Tables of the runs with bounds of a deviation of 1/2 at 68 %, on a and on b and c, and ten members of a."""
+    draws = np.random.default_rng(8)
+    (place / "stated").mkdir()
+    for run in range(70):
+        head, *rows = (place / f"tables/{run}.csv").read_text().splitlines()
+        lines = [",".join([head.split(",P_")[0], "bound_a", "radius_b_c", *(f"e{i}" for i in range(10))])]
+        for row in rows:
+            cells = row.split(",")[:7]
+            members = float(cells[4]) + 0.5 * (draws.normal() + draws.normal(size=10))
+            lines.append(",".join(map(str, [*cells, 0.4972, 0.7549, *members])))
+        (place / f"stated/{run}.csv").write_text("\n".join(lines) + "\n")
+    script(place, COPY.replace("tables", "stated"), "bounded")
+    return place
+
+
+def test_a_program_may_state_bounds(stated, capsys):
+    words = ("--level", "68%", "--runs", "40", "--json", "--out", "out", "--", "./bounded", "{run}")
+    out = monte_carlo(*words, capsys=capsys)[1]
+    bounds = next(iter(json.loads(out).values()))["statistics"]["bounds"]
+    assert [(one["name"], one["level"], one["runs"], one["steps"]) for one in bounds] == [
+        ("bound_a", 0.68, 40, 4 * 40), ("radius_b_c", 0.68, 40, 4 * 40)
+    ]  # fmt: skip
+    tables = [np.loadtxt(stated / f"stated/{run}.csv", delimiter=",", skiprows=1) for run in range(40)]
+    outside = np.mean([np.abs(table[:, 4] - table[:, 1]) > 0.4972 for table in tables])
+    assert bounds[0]["rate"] == pytest.approx(outside)
+    assert consistency("analyse", "out", "--json", capsys=capsys)[1] == out
+    kept = monte_carlo("--keep", "failed", "--overwrite", *words, capsys=capsys)[1]
+    assert kept == out
+    assert run_files(stated / "out", "estimates.csv") == []
+    assert consistency("analyse", "out", "--json", capsys=capsys)[1] == out
+
+
+def test_runs_of_bounds_and_members_are_planned_for_them(stated, capsys):
+    """Those that show a right bound of 68 %; of members more than of a covariance, as their numbers show less."""
+    options = {"state": ["a", "b", "c"], "jobs": 2, "detect": 3.0}
+    verdict = cs.monte_carlo(["./bounded", "{run}"], level="68%", **options)
+    assert verdict.runs == runs_to_show(0.68, 3.0)
+    few = InsufficientTrials
+    with pytest.raises(few, match="plan --level 68%") as found:
+        assert_program_consistent(["./bounded", "{run}"], level="68%", runs=5, **options)
+    assert found.value.needed == runs_to_show(0.68, 3.0)
+    members = cs.monte_carlo(["./bounded", "{run}"], members={"a": "e*"}, jobs=2, detect=5.0)
+    assert 1.2 * gate_runs(1, 5.0) < members.runs < 70
+    assert not members.failures
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (("--truth", "repeats"), ("--truth repeats", "column run", "analyse TABLE")),
+        (("--level", "95%", "--until-decided"), ("--until-decided", "bounds", "--runs")),
+        (("--level", "2"), ("--level 2", "below 100 %")),
+        (("--level", "95%", "--alert-limit", "0"), ("--alert-limit 0",)),
+    ],
+)
+def test_statements_that_a_program_cannot_make_are_refused(stated, capsys, words, parts):
+    status, _, err = monte_carlo(*words, "--out", "out", "--", "./bounded", "{run}", capsys=capsys)
+    assert status == 2
+    for part in parts:
+        assert part in err
 
 
 # --- Python ------------------------------------------------------------------------------------------------

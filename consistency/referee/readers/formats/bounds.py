@@ -7,15 +7,16 @@ component about its estimate. ``--gaussian`` declares that they stand for the co
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from consistency.referee.column_names import POSE
 from consistency.referee.diagnostics.exceedance import deviations_of, level_of
 from consistency.referee.diagnostics.record import Bound, Record
+from consistency.referee.diagnostics.verdict_parts import HAZARD
 from consistency.referee.errors import InputError
 from consistency.referee.readers.formats.columns import require_units
 from consistency.referee.readers.formats.sheet import TableRows
@@ -70,30 +71,58 @@ def level_of_text(given: Any) -> Level:
     return Level(text, None, value) if is_sigma else Level(text, value)
 
 
-class Levels:
-    """The level of each bound, one for all or by name."""
+def limit_of_text(given: Any) -> float:
+    """An alert limit of an option or argument; raises InputError for what is none."""
+    try:
+        limit = float(given)
+    except (TypeError, ValueError):
+        limit = float("nan")
+    if not 0.0 < limit < float("inf"):
+        raise InputError(f"--alert-limit {given}: must be above 0, in the unit of the bound; of each "
+                         "radius_x_y=40,bound_z=50")  # fmt: skip
+    return limit
 
-    def __init__(self, given: Any) -> None:
+
+T = TypeVar("T")
+
+
+class OfBounds(Generic[T]):
+    """The level or the alert limit of each bound, one for all or by name."""
+
+    def __init__(self, flag: str, parse: Callable[[Any], T], given: Any) -> None:
         pairs = given if isinstance(given, Mapping) else {}
         if not pairs and isinstance(given, str) and "=" in given:
             pairs = dict([*map(str.strip, each.partition("=")[::2])] for each in given.split(","))
-        self.by_name = {str(name): level_of_text(value) for name, value in pairs.items()}
-        self.every = None if pairs else level_of_text(given)
+        self.flag = flag
+        self.by_name = {str(name): parse(value) for name, value in pairs.items()}
+        self.every = None if pairs or given is None else parse(given)
 
-    def of(self, *names: str) -> Level:
-        """The level of a bound by any of its names."""
-        if self.every is not None:
-            return self.every
-        for name in names:
-            if name in self.by_name:
-                return self.by_name[name]
-        raise InputError(f"--level: says none for {names[0]}, only for {', '.join(self.by_name)}")
+    def get(self, *names: str) -> T | None:
+        """That of a bound by any of its names; None if it has none."""
+        return next((self.by_name[name] for name in names if name in self.by_name), self.every)
+
+    def of(self, *names: str) -> T:
+        """That of a bound by any of its names; raises InputError if it has none."""
+        found = self.get(*names)
+        if found is None:
+            raise InputError(f"{self.flag}: says none for {names[0]}, only for {', '.join(self.by_name)}")
+        return found
 
     def require(self, known: Sequence[str]) -> None:
-        """Refuse a level of a bound that is not there."""
+        """Refuse one of a bound that is not there."""
         for name in self.by_name:
             if name not in known:
-                raise InputError(f"--level {name}: there is no such bound; there are: {', '.join(known)}")
+                raise InputError(f"{self.flag} {name}: there is no such bound; there are: {', '.join(known)}")
+
+
+def levels_of(given: Any) -> OfBounds[Level]:
+    """Levels of bounds; raises InputError for what is none."""
+    return OfBounds("--level", level_of_text, given)
+
+
+def limits_of(given: Any) -> OfBounds[float]:
+    """Alert limits of bounds, where such are given; raises InputError for what is none."""
+    return OfBounds("--alert-limit", limit_of_text, given)
 
 
 def require_bound_options(r: Reading) -> None:
@@ -101,13 +130,15 @@ def require_bound_options(r: Reading) -> None:
     stated = r.statement
     if stated.ends not in (None, ENDS):
         raise InputError(f"--ends {stated.ends}: must be '{ENDS}'")
-    for flag, value in (("--gaussian", stated.gaussian), ("--ends", stated.ends)):
-        if value and stated.level is None:
+    of_bounds = {"--ends": stated.ends, "--alert-limit": stated.alert_limit}
+    for flag, value in ({"--gaussian": stated.gaussian or None} | of_bounds).items():
+        if value is not None and stated.level is None:
             raise InputError(f"{flag}: goes with --level, as --level 95%")
-    if stated.gaussian and stated.ends:
-        raise InputError("--ends: is for bounds; with --gaussian covariances are judged, so leave it out")
+        if value is not None and stated.gaussian and flag in of_bounds:
+            raise InputError(f"{flag}: is for bounds; with --gaussian covariances are judged, so leave it out")
     if stated.level is not None:
-        Levels(stated.level)
+        levels_of(stated.level)
+    limits_of(stated.alert_limit)
     if stated.level is not None and not stated.gaussian:
         others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
         r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
@@ -175,8 +206,7 @@ def stated_in(sheet: TableRows, axes: Sequence[str], options: StatementOptions) 
     found = bound_columns(list(sheet.data))
     if not found:
         return None
-    levels = Levels(options.level)
-    levels.require([name for one in found for name in (one.name, *one.columns)])
+    names = [(one.name, *one.columns) for one in found]
     require_units([name for one in found for name in one.columns], sheet.path)
     values = np.empty((len(sheet), len(found), 2))
     for k, one in enumerate(found):
@@ -185,8 +215,7 @@ def stated_in(sheet: TableRows, axes: Sequence[str], options: StatementOptions) 
                 raise InputError(f"{sheet.path}: {one.name} bounds '{component}', which is not in the state "
                                  f"{','.join(axes)}; --state names another")  # fmt: skip
         values[:, k] = _of_interval(sheet, one) if len(one.columns) == 2 else _of_bound(sheet, one)
-    of = [levels.of(one.name, *one.columns) for one in found]
-    return _stated([(one.name, one.components) for one in found], of, axes, options), values
+    return _stated(names, [one.components for one in found], axes, options), values
 
 
 def _of_bound(sheet: TableRows, one: BoundColumns) -> Array:
@@ -208,12 +237,22 @@ def _of_interval(sheet: TableRows, one: BoundColumns) -> Array:
 
 
 def _stated(
-    named: Sequence[tuple[str, tuple[str, ...]]], of: Sequence[Level], axes: Sequence[str], options: StatementOptions
+    names: Sequence[tuple[str, ...]],
+    bounded: Sequence[tuple[str, ...]],
+    axes: Sequence[str],
+    options: StatementOptions,
 ) -> Bounds:
+    """Bounds by their names, of which the first is shown, and the components that they bound."""
+    levels, limits = levels_of(options.level), limits_of(options.alert_limit)
+    known = list(dict.fromkeys(name for each in names for name in each))
+    levels.require(known)
+    limits.require(known)
+    of = [levels.of(*each) for each in names]
     bounds = []
-    for (name, components), level in zip(named, of, strict=True):
-        bounds.append(Bound(name, components, level.of(len(components)), options.ends == ENDS))
-    places = tuple(tuple(map(list(axes).index, components)) for _, components in named)
+    for each, components, level in zip(names, bounded, of, strict=True):
+        share = level.of(len(components))
+        bounds.append(Bound(each[0], components, share, options.ends == ENDS, limits.get(*each)))
+    places = tuple(tuple(map(list(axes).index, components)) for components in bounded)
     deviations = tuple(level.in_deviations(len(one)) for level, one in zip(of, places, strict=True))
     stated = Bounds(tuple(bounds), places, deviations, bool(options.gaussian))
     twice = [axes[i] for i in set(sum(places, ())) if sum(places, ()).count(i) > 1]
@@ -238,19 +277,19 @@ def stated_in_arrays(
     if options.level is None:
         raise InputError(f"{where}bounds need their level: --level 95%, or level=0.95 in Python")
     if bounds.shape == shape[:2]:
-        named = [(_name("radius" if len(axes) > 1 else "bound", axes), tuple(axes))]
+        names = [(_name("radius" if len(axes) > 1 else "bound", axes),)]
+        bounded = [tuple(axes)]
         bounds = bounds[..., None]
     elif bounds.shape == shape:
-        named = [(_name("bound", [axis]), (axis,)) for axis in axes]
+        names = [(_name("bound", [axis]),) for axis in axes]
+        bounded = [(axis,) for axis in axes]
     else:
         raise InputError(f"{where}bounds has shape {bounds.shape}, needs {shape} of each component, or {shape[:2]} of "
                          "the length of all")  # fmt: skip
     if (bounds < 0.0).any():
         run, step, _ = np.argwhere(bounds < 0.0)[0]
         raise InputError(f"{where}bounds, run {run}, step {step + 1}: negative; a bound is a size")
-    levels = Levels(options.level)
-    levels.require([name for name, _ in named])
-    return _stated(named, [levels.of(name) for name, _ in named], axes, options), np.stack([bounds, bounds], axis=-1)
+    return _stated(names, bounded, axes, options), np.stack([bounds, bounds], axis=-1)
 
 
 def _name(kind: str, axes: Sequence[str]) -> str:
@@ -270,7 +309,7 @@ def require_gaussian(where: str, options: StatementOptions) -> None:
 
 def covariance_factor(options: StatementOptions) -> float:
     """Factor on covariances whose deviations are stated at a level."""
-    level = Levels(options.level).of("the covariance")
+    level = levels_of(options.level).of("the covariance")
     return level.in_deviations(level.dimensions or 1) ** -2
 
 
@@ -293,13 +332,33 @@ def covariance_of(stated: Bounds, values: Array, n: int) -> Array:
 
 def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
     """Errors (N, n) over their bounds (N, bounds, 2), with the sign of single components, (N, bounds)."""
-    out = np.empty(values.shape[:2])
-    for k, index in enumerate(stated.places):
-        e = errors[:, index[0]] if len(index) == 1 else np.linalg.norm(errors[:, list(index)], axis=1)
-        size = np.where(e < 0.0, values[:, k, 0], values[:, k, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out[:, k] = np.where((e == 0.0) & ~np.isnan(size), 0.0, e / size)
-    return out
+    e = _bounded_errors(stated, errors)
+    size = np.where(e < 0.0, values[..., 0], values[..., 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((e == 0.0) & ~np.isnan(size), 0.0, e / size)
+
+
+def regions_of(stated: Bounds, values: Array, errors: Array) -> Array | None:
+    """Regions of the Stanford diagram of errors (N, n) with bounds (N, bounds, 2), by their places in REGIONS.
+
+    (N, bounds), NaN of a bound without an alert limit; None where no bound has one. Of an interval its longer side
+    decides whether it alerts.
+    """
+    limits = np.array([np.nan if bound.alert_limit is None else bound.alert_limit for bound in stated.bounds])
+    if np.isnan(limits).all():
+        return None
+    ratios = np.abs(ratios_of(stated, values, errors))
+    is_misleading = ratios > 1.0
+    is_hazard = np.abs(_bounded_errors(stated, errors)) > limits
+    regions = np.where(values.max(axis=-1) > limits, 3.0 + is_misleading, np.where(is_hazard, HAZARD, is_misleading))
+    return np.where(np.isnan(ratios + limits), np.nan, regions)
+
+
+def _bounded_errors(stated: Bounds, errors: Array) -> Array:
+    """What is bounded of errors (N, n): a component with its sign, or the length of several, (N, bounds)."""
+    return np.stack(
+        [errors[:, i[0]] if len(i) == 1 else np.linalg.norm(errors[:, list(i)], axis=1) for i in stated.places], axis=1
+    )
 
 
 def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:

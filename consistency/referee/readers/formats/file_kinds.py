@@ -34,7 +34,8 @@ PARTNERS = (*sorted(TRAJECTORIES), ".csv", ".pos", *TABLES)  # of a file of the 
 HELD_OUT, CORRECTED, CORRECTION = "held-out", "corrected", "correction.toml"  # of a folder of 'correct'
 SUFFIXES = (*TABLES, *ARCHIVES, *BAGS, ".pos", *TRAJECTORIES)  # of all kinds, for messages
 ARRAYS = "errors=truth - estimates, covariances=P"
-LOG, PACKED = "flight logs are for 'consistency monitor'", "unpack it"
+LOG = "flight logs are for 'consistency monitor'; accuracies such as eph go into a table, as radius_x_y with --level"
+PACKED = "unpack it"
 TEXT = "rename text to .csv, or to .txt if its columns have no names"
 HDF5, LOADED = "h5py.File(name)[key][()] is an array of it", "load it"
 SHEET = "save the sheet as .csv"

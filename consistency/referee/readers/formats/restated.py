@@ -1,4 +1,4 @@
-"""Text files of estimates, written again with other covariances and no other change."""
+"""Text files of estimates, written again with other covariances or bounds and no other change."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from consistency.referee.column_names import POSE
+from consistency.referee.readers.formats.bounds import bound_columns
 from consistency.referee.readers.formats.columns import covariance_columns, entry_name, pose_columns
 from consistency.referee.readers.formats.file_kinds import (
     ARCHIVES,
@@ -55,6 +56,8 @@ class TextFile:
     filter: str = ""  # whose lines are written
     by_column: int | None = None  # with the value of --by of each line
     added: Mapping[str, tuple[str, str]] = field(default_factory=dict)  # by name, to files that state none: as entries
+    # ends of intervals by their column: the bound, and the columns whose mean the interval grows about
+    ends: Mapping[int, tuple[str, tuple[int, ...]]] = field(default_factory=dict)
 
     def restated(self, change: Change) -> str:
         """The text with each covariance P as D P D + F, by the factors and floors of its run; without runs of None."""
@@ -107,6 +110,11 @@ class TextFile:
         for column, (a, b) in self.entries.items():
             if bare[column]:
                 restated[column] = repr(self._number(float(bare[column]), a, b, factors))
+        for column, (bound, about) in self.ends.items():
+            if all(bare[each] for each in (column, *about)):
+                middle = sum(float(bare[each]) for each in about) / len(about)
+                size = self._number(abs(float(bare[column]) - middle), bound, bound, factors)
+                restated[column] = repr(middle + float(np.copysign(size, float(bare[column]) - middle)))
         return restated + [repr(self._number(0.0, a, b, factors)) for a, b in self.added.values()]
 
     def _number(self, value: float, a: str, b: str, factors: Factors) -> float:
@@ -136,8 +144,9 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
     declared = r.conventions
-    if r.components.columns or declared.world or declared.body_axes:  # names and axes of the file are not the record's
-        return []
+    of_bounds = r.statement.level is not None and not r.statement.gaussian
+    if (r.components.columns and not of_bounds) or declared.world or declared.body_axes:
+        return []  # names and axes of the file are not the record's
     state = r.components.state
     found: list[TextFile | None] = []
     if estimates.is_dir() and table_files(estimates) and (state or not trajectory_files(estimates)):
@@ -156,9 +165,19 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
 
 def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFile | None:
     """A table, whose first line names its columns; of one ``run`` where that is given."""
-    head = head_of(path)
+    of_bounds = r.statement.level is not None and not r.statement.gaussian
+    head = head_of(path, r.components.columns if of_bounds else None)
     if head is None or any(column.startswith("own_P") for column in head.names):
         return None
+    places = dict(zip(head.names, head.places, strict=True))
+    run_column = by_column = None
+    if run is None:
+        run_column = places.get("run")
+    if r.groups.own_column is not None:
+        by_column = places.get(r.groups.own_column)
+    if of_bounds:
+        stated, ends = _bounds(places)
+        return TextFile(path, stated, False, run or 0, run_column, places.get("filter"), name, by_column, ends=ends)
     axes = r.components.state or POSE
     covariance = covariance_columns(head.names, axes)
     added = {}
@@ -169,14 +188,23 @@ def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFil
     elif not r.statement.unstated or head.comment or not set(axes) <= set(head.names):
         return None
     components = {place: (axes[i], axes[j]) for (i, j), place in covariance.places.items()}
-    places = {column: place for place, column in enumerate(head.names)}
-    run_column = by_column = None
-    if run is None:
-        run_column = places.get("run")
-    if r.groups.own_column is not None:
-        by_column = places.get(r.groups.own_column)
     squared = covariance.squared or bool(added)
     return TextFile(path, components, squared, run or 0, run_column, places.get("filter"), name, by_column, added)
+
+
+def _bounds(places: Mapping[str, int]) -> tuple[dict[int, tuple[str, str]], dict[int, tuple[str, tuple[int, ...]]]]:
+    """Columns of bounds as entries of deviations, each a component by itself, and the ends of intervals."""
+    stated: dict[int, tuple[str, str]] = {}
+    ends: dict[int, tuple[str, tuple[int, ...]]] = {}
+    for one in bound_columns(list(places)):
+        columns = [places[name] for name in one.columns]
+        if len(columns) == 1:
+            stated[columns[0]] = (one.name, one.name)
+            continue
+        (component,) = one.components
+        about = (places[component],) if component in places else tuple(columns)
+        ends |= dict.fromkeys(columns, (one.name, about))
+    return stated, ends
 
 
 def _trajectory(path: Path, run: int, r: Reading) -> TextFile | None:

@@ -52,7 +52,7 @@ def read_tables(estimates: Path | TableRows, r: Reading, poses_alone: bool = Fal
         raise InputError(f"--state {','.join(state)}: needs names of columns, each once")
     axes = tuple(r.components.members or state or _own_state(estimates, r) or POSE)
     sheet, truth, notes = _both(estimates, axes, r)
-    if state is None and axes != tuple(POSE):
+    if state is None and r.components.members is None and axes != tuple(POSE):
         what = "covariance P_* says" if r.statement.level is None else "bounds say"
         notes.append(f"{sheet.path}: the state is {','.join(axes)}, as its {what}; --state names another")
     convention = _convention(r.conventions.error, axes, truth) if r.components.members is None else "vector"

@@ -20,7 +20,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.planning import Design, sequential_design
-from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.record import Bound, Record
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import one_line, reading
@@ -33,6 +33,7 @@ from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import CutNote, Places, listed
 from consistency.referee.readers.truth_matching import (
     PLACES,
+    Bounds,
     Estimator,
     Poses,
     Stated,
@@ -519,9 +520,9 @@ def _one_estimator(
     )
 
 
-def _kind_of(error: StatedError) -> tuple[Sequence[str], Stated, str]:
+def _kind_of(error: StatedError) -> tuple[Sequence[str], Stated, str, Bounds | None]:
     """What the errors of all runs of an estimator have in common."""
-    return error.axes, error.stated, error.convention
+    return error.axes, error.stated, error.convention, error.bounds
 
 
 def _without_paths(note: str, one: Estimator) -> str:
@@ -549,6 +550,7 @@ def keep_numbers(folder: Path, estimators: Sequence[Estimator]) -> None:
             "alone": one.error.stated.alone,
             "groups": {name: [group.start, group.stop] for name, group in one.error.stated.groups.items()},
             "beside": p.true.t is p.own.t,
+            "bounds": one.error.bounds and [list(map(list, one.error.bounds.bounds)), *one.error.bounds[1:]],
         }
         for key in TEXTS:
             texts[key] = getattr(one.error if key in OF_ERROR else one, key)
@@ -591,5 +593,9 @@ def _estimator(i: int, texts: dict[str, Any], arrays: dict[str, Any]) -> Estimat
     of_estimator = {key: texts[key] for key in TEXTS if key not in OF_ERROR}
     of_error = {key: texts[key] for key in OF_ERROR}
     of_error["axes"] = tuple(texts["axes"])
-    error = StatedError(stated=Stated(groups, texts["alone"]), **of_error)
+    bounds = None
+    if texts.get("bounds"):  # folders written before lack them
+        stated, places, *rest = texts["bounds"]
+        bounds = Bounds(tuple(Bound(*each) for each in stated), tuple(map(tuple, places)), *rest)
+    error = StatedError(stated=Stated(groups, texts["alone"]), bounds=bounds, **of_error)
     return Estimator(path=path, runs=[poses], error=error, t=arrays.get(f"{i} times"), **of_estimator)

@@ -49,7 +49,11 @@ OF_BAGS = ("topic", "truth_topic")
 OF_FILES = ("state", "covariance", "covariance_order", "truth", "lever_arm")  # bags have these in messages
 OF_STATES = ("state", "dof", "members")
 OF_NAMES = ("columns", "truth_columns")
-OF_BOUNDS = ("level", "gaussian", "ends")
+OF_BOUNDS = ("level", "gaussian", "ends", "alert_limit")
+OF_TABLES = (
+    "bounds and members stand in a table of t, the components, and radius_x_y, bound_x or x_low and x_high with "
+    "--level, or columns of --members; or in an archive (.npz)"
+)
 OF_TRUTH = ("truth_covariance", "truth_errors", "truth_shared")
 OF_TRUTH_FILES = ("truth", "max_dt", "time_offset", "align", "truth_covariance")  # of truth in a file of its own
 OF_OTHERS_THAN_ARCHIVES = (*OF_NAMES, *OF_AXES, *OF_BAGS, *OF_STATES, *OF_TRAJECTORIES, *OF_TRUTH_FILES)
@@ -183,6 +187,8 @@ def refuse_options(path: Path, r: Reading, *names: str) -> None:
         instead = ""
         if path.suffix.lower() in ARCHIVES and given[0] in ARCHIVE_KEYS:
             instead = f", an archive; it has a key '{ARCHIVE_KEYS[given[0]]}' in its place"
+        elif given[0] in (*OF_BOUNDS, "members"):
+            instead = f", which states covariances alone; {OF_TABLES}"
         raise InputError(f"{flag_of(given[0])}: does not go with {path}{instead}")
 
 

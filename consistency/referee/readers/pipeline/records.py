@@ -374,11 +374,12 @@ def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[i
 
 def _track(e: Estimator, p: Poses, error: Array) -> Track:
     """Errors of a run with their covariances; its columns are not yet known."""
-    path = t = ratios = None
+    path = t = ratios = regions = None
     if e.error.bounds is not None and p.own.bounds is not None:
-        from consistency.referee.readers.formats.bounds import ratios_of
+        from consistency.referee.readers.formats.bounds import ratios_of, regions_of
 
         ratios = ratios_of(e.error.bounds, p.own.bounds, error)
+        regions = regions_of(e.error.bounds, p.own.bounds, error)
     width = e.error.position
     if width:
         true = p.true.values[:, :width]
@@ -398,6 +399,7 @@ def _track(e: Estimator, p: Poses, error: Array) -> Track:
         truth_covariance=p.true.covariance,
         path=path,
         bound_ratios=ratios,
+        regions=regions,
     )
 
 

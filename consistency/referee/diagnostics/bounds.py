@@ -158,16 +158,16 @@ def _score(q: Question, settings: Settings, given: Sequence[Answer], is_fault: b
 
 def _alerts(q: Question) -> Alerts | None:
     """Shares of the steps in the regions of the Stanford diagram; None without an alert limit."""
-    if q.regions is None or q.bound.alert_limit is None:
+    regions, limit = q.regions, q.bound.alert_limit
+    if regions is None or limit is None:
         return None
 
     def of(region: int) -> Exceedance:
         """Steps in a region as those outside a bound."""
-        is_inside = np.where(np.isnan(q.regions), np.nan, 2.0 * (q.regions == region))
-        return replace(q.sizes, ratios=is_inside)
+        return replace(q.sizes, ratios=np.where(np.isnan(regions), np.nan, 2.0 * (regions == region)))
 
     shares = tuple(of(region).rate() for region in range(len(REGIONS)))
-    return Alerts(q.bound.alert_limit, shares, of(HAZARD).rate_limit())
+    return Alerts(limit, shares, of(HAZARD).rate_limit())
 
 
 def _share_of_side(ratios: Array) -> float:

@@ -413,7 +413,8 @@ def _filter_of(table: Any, place: str) -> tuple[RunSummary, int, tuple[str, ...]
     kind = table.get("kind", "")
     if not isinstance(kind, str):
         raise ValueError(f"key '{place}.kind': not a text")
-    return RunSummary(np.array(runs, np.int64), dof, *parts, kind), failures, tuple(axes)
+    nees, squared, covered = parts
+    return RunSummary(np.array(runs, np.int64), dof, nees, squared, covered, kind), failures, tuple(axes)
 
 
 def _list(values: Any, place: str, longest: int | None = None) -> list[Any]:

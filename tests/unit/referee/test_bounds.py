@@ -542,6 +542,9 @@ def test_an_excluded_rate_of_hazards_counts_missing_steps_and_is_three_over_runs
     (line,) = [one for one in cs.judge(e, bounds=bounds, level=0.95, alert_limit=6).reasons if "alert limit" in one]
     for part in ("in 0 % of the steps", "3 % or more is excluded", "100 runs never show a rate below 3 %", "1e-7"):
         assert part in line
+    small = cs.judge(e, bounds=0.3 * bounds, level=0.95, alert_limit=6.0).bounds[0].alerts
+    assert small.shares[1] > 0.05  # misleading, and not a hazard
+    assert small.hazard_limit == alerts.hazard_limit
     e[:10, 30:] = np.nan
     ended = cs.judge(e, bounds=bounds, level=0.95, alert_limit=6.0).bounds[0].alerts
     assert ended.hazard_limit > alerts.hazard_limit + 0.02

@@ -188,7 +188,9 @@ def inspect_files(path: Path, r: Reading | None = None) -> Inspection:
     arguments = tried.reading.as_options()
     notes += _groups(path, tried)
     if run_of(path) is not None:
-        notes.append(f"one of the runs of a study: {_command('analyse', path.absolute().parents[1], Reading())} judges all")
+        notes.append(
+            f"one of the runs of a study: {_command('analyse', path.absolute().parents[1], Reading())} judges all"
+        )
     return Inspection(path, kind.name, facts, tuple(notes), tuple(why), command, arguments=arguments)
 
 

@@ -3,7 +3,7 @@ Libraries and their covariances
 ===============================
 
 Ratio of true to stated covariance for the cases of :doc:`docs/case-studies.md </case-studies>`, with 95 % intervals:
-what was judged (orange; a triangle for the axis that decides), and a control on the same data (blue).
+what was judged (purple; a triangle for the axis that decides), and a control on the same data (blue).
 """
 
 import json

@@ -7,6 +7,7 @@ Ubuntu 22.04: without the stash of 7.0, and with wrappers of hooks in their olde
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ from consistency.referee.gating.session import (
     Ledger,
     RunningTest,
     current,
+    folder_fault,
     in_place_rate,
+    is_shown,
     path_fault,
     to_property,
     watching,
@@ -41,6 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--consistency-runs", type=int, metavar="N", help="runs to simulate, in place of the number planned for a test"
     )
     group.addoption("--consistency-report", metavar="FILE", help="write all gates to FILE: .json, .html, .xml, .md")
+    group.addoption("--consistency-pages", metavar="FOLDER", help="write a page of every gate that fails to FOLDER")
     rate = "false-alarm rate of the whole session, split over the gates that state none of their own"
     group.addoption("--consistency-false-alarm", type=float, metavar="RATE", help=rate)
     parser.addini("consistency_false_alarm", rate)
@@ -56,7 +60,11 @@ def pytest_configure(config: pytest.Config) -> None:
     worker = hasattr(config, "workerinput")
     if path is not None and not worker and (why := path_fault(path)):
         raise pytest.UsageError(why)
-    config.pluginmanager.register(Gates(config, runs, path, _budget(config), worker), NAME)
+    pages = config.getoption("--consistency-pages")
+    folder = None if pages is None else config.invocation_params.dir / pages
+    if folder is not None and not worker and (why := folder_fault(folder)):
+        raise pytest.UsageError(why)
+    config.pluginmanager.register(Gates(config, runs, path, folder, _budget(config), worker), NAME)
 
 
 def _budget(config: pytest.Config) -> float | None:
@@ -100,9 +108,10 @@ class Gates:
     """The hooks of one session; in an xdist worker those of its tests, in the controller those of the session."""
 
     def __init__(
-        self, config: pytest.Config, runs: int | None, path: Path | None, budget: float | None, worker: bool
-    ) -> None:
-        self.config, self.runs, self.path, self.worker = config, runs, path, worker
+        self, config: pytest.Config, runs: int | None, path: Path | None, folder: Path | None, budget: float | None,
+        worker: bool,
+    ) -> None:  # fmt: skip
+        self.config, self.runs, self.path, self.folder, self.worker = config, runs, path, folder, worker
         self.budget = budget
         self.collected = 1
         self.ledger = Ledger(budget)
@@ -128,8 +137,11 @@ class Gates:
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, None]:
         with watching(
-            RunningTest(budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry))
-        ):
+            RunningTest(
+                budget=self.budget, tests=self.collected, keep=lambda entry: self._keep(item, entry),
+                page=lambda: self._page(item),
+            )
+        ):  # fmt: skip
             yield
 
     @pytest.hookimpl(tryfirst=True)
@@ -140,6 +152,13 @@ class Gates:
         watch.marked, why = marked(item)
         if why:
             pytest.fail(why, pytrace=False)
+
+    def _page(self, item: pytest.Item) -> Path | None:
+        """File for the page of the next gate of a test, named after both."""
+        if self.folder is None:
+            return None
+        gate = sum(key == PROPERTY for key, _ in item.user_properties) + 1
+        return self.folder / f"{re.sub(r'[^A-Za-z0-9._]+', '-', item.nodeid)[-150:]}-{gate}.html"
 
     def _keep(self, item: pytest.Item, entry: Entry) -> None:
         item.user_properties.append(to_property(entry))
@@ -171,6 +190,9 @@ class Gates:
             self._fail(tested.nodeid, tested.location, "\n\n".join(texts))
             if session.exitstatus == pytest.ExitCode.OK:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
+        for entry in self.ledger.entries():
+            if entry.page and not is_shown(entry):
+                Path(entry.page).unlink(missing_ok=True)
         if self.path is not None and not self.config.option.collectonly:
             from consistency.referee.gating.gate_results import write_gates
 
@@ -192,6 +214,8 @@ class Gates:
             terminalreporter.section("consistency gates")
             for line in gate_lines(self.ledger):
                 terminalreporter.write_line(line)
+            for entry in filter(is_shown, self.ledger.entries()):
+                terminalreporter.write_line(f"page of {entry.test}: {entry.page}")
             if self.path is not None:
                 terminalreporter.write_line(f"report in {self.path}")
 

@@ -26,7 +26,7 @@ from consistency.referee.gating.checked_input import (
     record_of_filter,
     record_of_read,
 )
-from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide
+from consistency.referee.gating.gate_results import GateResult, entry_of, marker_text, runs_to_decide, write_page
 from consistency.referee.gating.session import Terms, current, fault_text, few_to_compare, terms, undecided_text
 
 if TYPE_CHECKING:
@@ -374,9 +374,15 @@ def _settle(
     outcome = "fault found" if fault else "too few runs" if few else "passed"
     if few:  # ask for what is enough at the end of the session too, and for more than there are
         least = max(needed(demand.false_alarm), runs_to_decide(result, runs))
-    current().keep(entry_of(gate, record, demand, result, late, outcome, least))
+    verdict = result.verdict
+    if fault and verdict is None:
+        verdict = judge(record, _settings(demand.false_alarm, demand))
+    page = None
+    if (fault or few or late is not None) and verdict is not None:
+        page = write_page(record, verdict)
+    current().keep(entry_of(gate, record, demand, result, late, outcome, least, page))
     if fault:
-        verdict = result.verdict or judge(record, _settings(demand.false_alarm, demand))
+        assert verdict is not None
         raise ConsistencyError(fault_text(gate, record.name, result.reasons), verdict, result.comparison)
     if few:
         if result.verdict is None:

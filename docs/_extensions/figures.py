@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx_gallery.scrapers import figure_rst
 
+from consistency.referee.show.blocks import COLOURS
 from consistency.referee.system import quiet
 
 LOOK = {
     "axes.linewidth": 0.7,
-    "axes.prop_cycle": mpl.cycler(color=["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]),
+    "axes.prop_cycle": mpl.cycler(color=COLOURS),
     "axes.spines.right": False,
     "axes.spines.top": False,
     "font.family": "DejaVu Sans",

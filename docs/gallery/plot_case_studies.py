@@ -3,7 +3,7 @@ Libraries and their covariances
 ===============================
 
 Ratio of true to stated covariance for the cases of :doc:`docs/case-studies.md </case-studies>`, with 95 % intervals:
-what was judged (orange; a triangle for the axis that decides), and a control on the same data (blue).
+what was judged (purple; a triangle for the axis that decides), and a control on the same data (blue).
 """
 
 import json
@@ -38,6 +38,9 @@ for k, (_, row, control) in enumerate(lines):
     for (value, low, high), color, marker, aside in bars:
         axes.plot([low, high], [k + aside] * 2, color=color, lw=1.4)
         axes.plot(value, k + aside, marker, color=color, ms=4)
+for color, marker, label in (("C1", "o", "judged"), ("C1", "^", "axis that decides"), ("C0", "o", "control")):
+    axes.plot([], [], marker, color=color, ms=4, label=label)
+figure.legend(loc="outside upper center", ncols=3)
 axes.axvline(1.0, color="0.6", lw=0.8, zorder=0)
 axes.set(xscale="log", xlim=(3e-4, 300), ylim=(len(lines) - 0.4, -0.6), xlabel="true / stated covariance")
 axes.set_yticks(range(len(lines)), labels=[name for name, *_ in lines], fontsize=7)

@@ -3,7 +3,7 @@ Ellipses of a visual-odometry motion
 ====================================
 
 One motion between two stereo pairs is estimated 1,000 times from simulated matches of 60 points. The scatter of the
-estimates (black ellipse, 2 sigma) is what the covariance that one of them states (green) should be.
+estimates (black ellipse, 2 sigma) is what the covariance that one of them states (blue) should be.
 """
 
 import matplotlib.pyplot as plt
@@ -38,7 +38,7 @@ for axes, pair, unit in zip(panels, ([0, 2], [0, 1], [3, 4]), ("mm", "mm", "mrad
     cloud = 1e3 * samples[:, pair]
     axes.plot(*cloud.T, ".", color="0.6", ms=2, zorder=0)
     axes.plot(*ellipse(cloud.mean(axis=0), np.cov(cloud.T)), "k", lw=1.5, label="scatter")
-    axes.plot(*ellipse(1e3 * motion.vector[pair], 1e6 * stated[np.ix_(pair, pair)]), "C2--", lw=1.5, label="stated")
+    axes.plot(*ellipse(1e3 * motion.vector[pair], 1e6 * stated[np.ix_(pair, pair)]), "C0--", lw=1.5, label="stated")
     x, y = (("x", "y", "z", "roll", "pitch", "yaw")[i] for i in pair)
     axes.set(xlabel=f"{x}, {unit}", ylabel=f"{y}, {unit}")
 figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)

@@ -346,7 +346,7 @@ PREPARE = {
     "docs/reference/file-kinds.md OpenVINS": [openvins],
     "docs/reference/file-kinds.md Poses with velocity and biases": [moving],
     "docs/reference/file-kinds.md KITTI": [kitti],
-    "docs/reference/file-kinds.md Logs": [log("LOG")],
+    "docs/reference/results-and-logs.md Logs": [log("LOG")],
     "docs/files.md Relative poses": [motions],
     "docs/front-end.md": [images],
     "docs/groups.md": [grouped],

@@ -181,8 +181,8 @@ def compare(given: Inputs, estimates: str) -> tuple[bool, list[Row]]:
 
 def markdown(verdict: str, rows: list[Row], why: str = "") -> str:
     """The summary of the job."""
-    from consistency.referee.show.blocks import Column, Document, table
     from consistency.referee.show.as_md import render
+    from consistency.referee.show.blocks import Column, Document, table
 
     heads = tuple(map(Column, ("what", "verdict", "ratio of covariances", "runs", "why")))
     return render(Document(f"Consistency: {verdict}", why, (), (table(heads, rows, "Verdicts"),) if rows else ()))

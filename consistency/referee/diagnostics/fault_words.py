@@ -584,6 +584,8 @@ def _without_fault(by: ByGroup) -> str:
     right = sum(group.status == "consistent" for group in by.groups)
     if right == count:
         return f"consistent in each of {count} groups by {by.column}"
+    if all(_is_of_few(group) for group in by.groups):
+        return f"all {count} groups by {by.column} undecided"
     return f"consistent in {right} of {count} groups by {by.column} (farthest {ratio_text(worst.ratio)}, {worst.name})"
 
 
@@ -592,14 +594,24 @@ def lines_of_groups(by: ByGroup, unit: str) -> list[str]:
     lines = []
     if by.outcome:
         lines.append(f"{by.column} {by.outcome}, which selects on the outcome: groups show, they do not convict")
-    lines += [f"{group.name}: {_figures(group, unit)}" for group in by.groups]
+    few = all(_is_of_few(group) for group in by.groups)
+    lines += [f"{group.name}: {_figures(group, unit, few)}" for group in by.groups]
+    if few:
+        lines.append(f"groups by {by.column} are undecided: {plural(by.worst.runs, unit)}{_advice(by.worst, unit)}")
     if by.without:
         lines.append(f"{plural(by.without, 'step')} without a value of {by.column} {is_or_are(by.without)} in no group")
     return lines
 
 
-def _figures(group: Group, unit: str) -> str:
-    """Ratio, verdict and size of a group."""
+def _is_of_few(group: Group) -> bool:
+    """Whether a group is undecided in runs that are too few to tell its errors from chance."""
+    return group.status == "undecided" and group.runs < FEW
+
+
+def _figures(group: Group, unit: str, few: bool) -> str:
+    """Ratio, verdict and size of a group; of one among ``few`` runs the bare ratio, as the advice stands below all."""
+    if few:
+        return f"covariance ratio {short(group.ratio.value)}, in {plural(group.steps, 'step')}"
     text = f"covariance ratio {ratio_text(group.ratio)}"
     if group.status:
         text += f", {group.status}"

@@ -321,10 +321,8 @@ def _levels(v: Findings, s: Scale) -> list[str]:
     if not v.faults:
         lines += _two_intervals(s, v.unit)
     worst = axis_at_fault(v.worst_axis)
-    of_all = ratio_text(s.inflation)
     if v.faults and worst is not None:
-        where = since_text(v)
-        lines.append(f"covariance ratio of the worst axis{where}: {worst[0]}, {ratio_text(worst[1])}; of all {of_all}")
+        lines.append(_ratios(v, s, *worst))
     elif v.worst_axis is not None and not set(SCALE).isdisjoint(v.faults):
         from consistency.referee.diagnostics.fault_words import combination_text
 
@@ -344,6 +342,25 @@ def _levels(v: Findings, s: Scale) -> list[str]:
             lines.append(f"{name}: {_level(part, part.scale, part.location)}")
         lines += [f"{name}: {line}" for line in _groups(part.by_group, v.unit)]
     return lines
+
+
+def _ratios(v: Findings, s: Scale, worst: str, of_worst: Interval) -> str:
+    """Ratio of variances of the worst axis, of position and attitude of a pose, and of all axes since the fault began.
+
+    The step in which a fault begins depends on the false-alarm rate; the ratio over all steps does not.
+    """
+    text = f"covariance ratio of the worst axis{since_text(v)}: {worst}, {ratio_text(of_worst)}"
+    assert v.axes is not None
+    names = list(v.axes.names)
+    for block, members in (("position", POSITION), ("attitude", ATTITUDE)):
+        own = [name for name in names if name in members]
+        ratio = v.axes.inflation.get(block if len(own) > 1 else "".join(own))
+        if ratio is not None and POSITION & {*names} and ATTITUDE & {*names} and own != [worst]:
+            text += f"; {block} {ratio_text(ratio)}"
+    text += f"; all axes {ratio_text(s.inflation)}, in sigmas x{short(float(np.sqrt(s.inflation.value)))}"
+    if v.location is not None and v.location.since is not None:
+        text += f"; over all {v.places} {short(s.mean_anees / s.dof)}"
+    return text
 
 
 def _two_intervals(s: Scale, unit: str) -> list[str]:

@@ -13,7 +13,17 @@ from consistency.referee.diagnostics.comparison import Comparison
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.gating.checked_input import planned_detect, planned_dof, rate_shares
-from consistency.referee.gating.session import DEFAULTS, Entry, Ledger, Terms, current, ending, outcome_text, wanted
+from consistency.referee.gating.session import (
+    DEFAULTS,
+    Entry,
+    Ledger,
+    Terms,
+    current,
+    ending,
+    is_shown,
+    outcome_text,
+    wanted,
+)
 from consistency.referee.show import rendered
 from consistency.referee.show.blocks import (
     Cell,
@@ -75,8 +85,9 @@ def runs_to_decide(result: GateResult, runs: int) -> int:
 
 
 def entry_of(
-    gate: str, record: Record, demand: Terms, result: GateResult, late: GateResult | None, outcome: str, least: int
-) -> Entry:
+    gate: str, record: Record, demand: Terms, result: GateResult, late: GateResult | None, outcome: str, least: int,
+    page: Path | None = None,
+) -> Entry:  # fmt: skip
     """The entry of a gate; ``late`` is its result at the whole budget, and ``least`` the runs that it asks for."""
     fields = summary_of(result)
     if result.verdict is not None:
@@ -97,9 +108,19 @@ def entry_of(
         in_place=in_place,
         runs=len(record.run_numbers), needed=least, dof=planned_dof(record), parts=rate_shares(record),
         planned_detect=planned_detect(record, demand.detect),
-        detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost,
+        detect=demand.detect, power=demand.power, allow=demand.allow, lost=demand.lost, page=str(page or ""),
         **fields,
     )  # fmt: skip
+
+
+def write_page(record: Record, verdict: Verdict) -> Path | None:
+    """The page of a gate with pictures, where its session asks for pages: its file."""
+    path = current().page()
+    if path is not None:
+        from consistency.referee.pages.write_pages import write_file_pages
+
+        write_file_pages([record], {record.name: verdict}, path, None, record.name)
+    return path
 
 
 def summary_of(result: GateResult) -> dict[str, Any]:
@@ -127,6 +148,7 @@ def _cells(e: Entry) -> dict[str, Cell]:
     value, *ends = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
     low, high = (float("inf") if end is None else end for end in ends)
     axis = ""
+    page = [f"page: {e.page}"] * is_shown(e)
     if e.axis:
         axis = f" in {e.axis}"
     return {
@@ -136,7 +158,7 @@ def _cells(e: Entry) -> dict[str, Cell]:
         "true / stated": Quantity(
             value, (low, high), axis, digits=".3g", is_factor=True
         ),
-        "why": Reason(f"{e.gate} {e.name}", first, tuple(rest), None, e.outcome == "passed" or wanted(e), e.test),
+        "why": Reason(f"{e.gate} {e.name}", first, (*rest, *page), None, e.outcome == "passed" or wanted(e), e.test),
         "": Reason(e.name, first, has_passed=e.outcome != "fault found"),
     }  # fmt: skip
 
@@ -155,7 +177,7 @@ def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:
     for entry in entries:
         cells = _cells(entry)
         gate_rows.append(tuple(cells[head] for head in heads))
-    return table(columns, gate_rows, "Gates")
+    return table(columns, gate_rows, "Gates", style="narrow")
 
 
 def gate_lines(ledger: Ledger) -> list[str]:
@@ -170,7 +192,7 @@ def gate_document(ledger: Ledger) -> Document:
         "budget": ledger.budget,
         "false_alarm_each": ledger.rate,
         "false_alarm_bound": ledger.bound(),
-        "gates": [vars(entry) for entry in ledger.entries()],
+        "gates": [{**vars(entry), "page": entry.page * is_shown(entry)} for entry in ledger.entries()],
     }
     words = badges([(entry.test or entry.name, entry.status) for entry in ledger.entries()])
     shown = _table(ledger.entries(), HEADS)

@@ -90,6 +90,7 @@ class Entry:
     standard_error: float | None = None
     spread: dict[str, float] = field(default_factory=dict)  # what else plans the runs of a comparison
     lost: float | None = None  # share of lost runs that must not pass
+    page: str = ""  # file of the page with pictures, of a gate that did not pass
     late: dict[str, Any] = field(default_factory=dict)  # what changes here if the end of the session finds the fault
     statistics: dict[str, Any] = field(default_factory=dict)  # all of the verdict
     test: str = ""
@@ -127,6 +128,7 @@ class RunningTest:
     plan: Callable[[int], int] | None = None  # runs that the fixture would give by dimension of the error; None unasked
     budgeted: int = 0  # gates of this test that ran on the budget
     keep: Callable[[Entry], None] = lambda entry: None
+    page: Callable[[], Path | None] = lambda: None  # a new file for the page of a gate, where pages are asked for
 
 
 def current() -> RunningTest:
@@ -366,12 +368,28 @@ def wanted(e: Entry) -> bool:
     return e.outcome != "passed" and e.test_outcome == "passed"
 
 
+def is_shown(e: Entry) -> bool:
+    """Whether the page of a gate is kept: it did not pass, and its test did not want that."""
+    return bool(e.page) and e.outcome != "passed" and not wanted(e)
+
+
+def folder_fault(folder: Path) -> str:
+    """Why pages cannot be written to a folder, which is made if it is missing; '' if they can."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        return f"--consistency-pages {folder}: cannot be written ({error.strerror}); name another folder"
+    return ""
+
+
 def path_fault(path: Path) -> str:
     """Why a report cannot be written there, and what to do; '' if it can."""
     if path.suffix.lower() not in FORMATS:
         return f"--consistency-report {path}: must end in {' or '.join(FORMATS)}"
     if path.is_dir():
-        return f"--consistency-report {path}: is a folder; name a file in it"
+        return f"--consistency-report {path}: is a folder; name a file in it, or --consistency-pages {path}"
     if not path.parent.is_dir():
         return f"--consistency-report {path}: the folder {path.parent} does not exist; make it first"
     try:

@@ -125,7 +125,8 @@ def verdicts_caption(study: Judged) -> str:
     elif not study.has_truth:
         what = "the ratio of the NIS to its degrees of freedom"
     text += f". Shown inside {equivalence_interval(study)}: whether {what} is shown to lie there"
-    if len(study.judged) < len(study.tracks):
+    innovations = [track.verdict.innovations for track in study.tracks]
+    if any(own is not None and np.isfinite(own.ratio) and not own.judged for own in innovations):
         text += ". NIS in parentheses: reported and not judged, as no optimal gain is declared"
     if own := study.own_errors:
         text += f". Judged in an error of their own, but for the RMSE: {names_in_a_row(own)}; see Errors of their own"

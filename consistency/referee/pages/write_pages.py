@@ -266,8 +266,9 @@ def answer(judged: Mapping[str, Verdict]) -> str:
 
 
 def _begun(note: str) -> str:
-    """A note as a sentence; a path at its beginning stays as it is."""
-    if "/" in note.split(maxsplit=1)[0]:
+    """A note as a sentence; a path, or the name of an estimator, at its beginning stays as it is."""
+    first = note.split(maxsplit=1)[0]
+    if "/" in first or first.endswith(":"):
         return _ended(note)
     return _ended(note[:1].upper() + note[1:])
 

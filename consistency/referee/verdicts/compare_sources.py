@@ -50,7 +50,7 @@ class Compared:
     def sentence(self) -> str:
         c = self.comparison
         own, reference = self.names
-        found = "not found less consistent"
+        found = "not shown to be less consistent"
         way = "as independent samples"
         if c.worse:
             found = "less consistent"

@@ -36,10 +36,12 @@ from consistency.referee.readers.formats.columns import (
 from consistency.referee.readers.formats.innovation_files import SeveralError
 from consistency.referee.readers.options import OPTIONS, Reading, flag_of, make_reading
 from consistency.referee.readers.pipeline import read_files
+from consistency.referee.readers.pipeline.program_runs import run_of
 from consistency.referee.readers.places import listed
 from consistency.referee.readers.runs_to_record import not_estimated
 from consistency.referee.readers.truth_matching import WHOLE, Estimator, submatrices
 from consistency.referee.show.blocks import Block, Bullets, Document, Facts, Text, fragment
+from consistency.referee.system import read_manifest
 from consistency.referee.types import Array
 from consistency.referee.verdicts.compare_sources import is_baseline
 from consistency.referee.verdicts.monitor_sources import read_innovations
@@ -64,6 +66,20 @@ LARGE = 1e6  # a variance from which on it says that nothing is known
 UNLIKE = 100.0  # ratio of two deviations of one unit
 EPOCH = 1e9  # s: times since 1970
 OPTIMAL = "declares the optimal (Kalman) gain, without which innovations cannot be judged"
+JUDGING = ("analyse", "monitor", "correct", "fit-covariance")
+PAGE = "report.html"
+NOT_JUDGED = f"{{path}}: holds no estimates; inspect those that it was made from. {PAGE} in it shows the result"
+NOT_RUN = "a filter to run: consistency run --log {path} --filter F --out results; see 'consistency list'"
+STORED: dict[str, tuple[str, tuple[str, ...]]] = {
+    "results": ("results of 'consistency run'", ("analyse", "{path}")),
+    "log": ("recorded log of the bench", ()),
+    "findings": ("findings of 'consistency reproduce'", ("report", "{path}", "--html", PAGE)),
+    "sweep": ("sweep over a grid of worlds", ("sweep", "{path}")),
+    "cell": ("one world of a sweep", ("sweep", "{path}/../..")),
+    "correction": ("correction of 'consistency correct'", ("inspect", "{path}/held-out")),
+    "verdict": ("report of 'consistency analyse'", ()),
+    "noise": ("noise model of 'consistency fit-covariance'", ()),
+}  # kinds of folders by their manifest: what each is, and the command that reads it
 Pairs = tuple[tuple[str, str], ...]
 
 
@@ -99,7 +115,8 @@ def inspection_document(found: Inspection) -> Document:
     if found.options:
         blocks += [Text("Options of the command, and why:"), Facts(found.options)]
     if found.command:
-        blocks += [Text("To judge it:"), Text(f"  {found.command}")]
+        judges = found.command.split()[1] in JUDGING
+        blocks += [Text("To judge it:" if judges else "To read it:"), Text(f"  {found.command}")]
     return Document(str(found.path), "", (), tuple(blocks), {**vars(found), "path": str(found.path), "arguments": None})
 
 
@@ -140,11 +157,14 @@ def inspect_files(path: Path, r: Reading | None = None) -> Inspection:
     if read_files.is_program_runs(path):
         facts = tuple(chain.from_iterable(map(_facts, read_files.read_recordings(path, r))))
         return Inspection(path, "runs of 'consistency monte-carlo'", facts, command=_command("analyse", path, r))
-    if not read_files.is_recording(path, r):
-        if (path / "estimates.parquet").exists():
-            return Inspection(path, "results of 'consistency run'", command=_command("analyse", path, r))
-        what = f"a filter to run: consistency run --log {path} --filter F --out results; see 'consistency list'"
-        return Inspection(path, "recorded log of the bench", missing=what)
+    if (path / "manifest.json").is_file() or (path / "estimates.parquet").is_file():
+        return _stored(path, r)
+    try:
+        read_files.is_recording(path, r)
+    except InputError:
+        if not (path / PAGE).is_file():
+            raise
+        return Inspection(path, "page of this bench", missing=NOT_JUDGED.format(path=path))
     if path.suffix.lower() == ".json" and is_baseline(path):
         what = f"newer estimates, to be compared with it: consistency compare NEW {path}"
         return Inspection(path, "file of 'consistency baseline'", missing=what)
@@ -169,7 +189,31 @@ def inspect_files(path: Path, r: Reading | None = None) -> Inspection:
     command = _command("analyse", path, tried.reading, extra)
     arguments = tried.reading.as_options()
     notes += _groups(path, tried)
+    if run_of(path) is not None:
+        notes.append(
+            f"one of the runs of a study: {_command('analyse', path.absolute().parents[1], Reading())} judges all"
+        )
     return Inspection(path, kind.name, facts, tuple(notes), tuple(why), command, arguments=arguments)
+
+
+def _stored(path: Path, r: Reading) -> Inspection:
+    """A folder that a command of the bench wrote, by its manifest, and the command that reads it."""
+    manifest = read_manifest(path) if (path / "manifest.json").is_file() else {}
+    read_files.is_recording(path, r)  # refuses options that do not go with it
+    kind = manifest.get("kind", "results")
+    scenario = manifest.get("scenario")
+    facts = [
+        ("written by", manifest.get("command")),
+        ("scenario", scenario.get("name") if isinstance(scenario, Mapping) else None),
+        ("filters", listed(manifest.get("filters", ()), 30)),
+        ("runs", manifest.get("runs")),
+    ]
+    shown = tuple((name, str(value)) for name, value in facts if value not in (None, ""))
+    what, words = STORED.get(kind, (f"{kind} of this bench", ()))
+    if words:
+        command = shlex.join(["consistency", *(word.format(path=path) for word in words)])
+        return Inspection(path, what, shown, command=command)
+    return Inspection(path, what, shown, missing=(NOT_RUN if kind == "log" else NOT_JUDGED).format(path=path))
 
 
 def says_more(path: Path, r: Reading) -> bool:

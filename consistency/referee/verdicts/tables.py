@@ -122,7 +122,7 @@ def true_over_stated(v: Verdict, whole: Quantity) -> Cell:
         from consistency.referee.diagnostics.bound_words import deciding, factor_text
 
         one = deciding(v.bounds)
-        return f"{factor_text(one.factor)} x {one.name}"
+        return f"{factor_text(one.factor)} in {one.name}"
     if v.status == "biased" and v.bias is not None and v.bias.inflation_without is not None:
         return f"{ratio_text(v.bias.inflation_without)} about the mean"
     return whole if v.axis is None else f"{ratio_text(v.axis[1])} in {v.axis[0]}"
@@ -214,9 +214,14 @@ FURTHER = (
 
 
 def page(inside: str) -> tuple[Measure, ...]:
-    """Of a report; ``inside`` is where the ratio of consistent filters is shown to be."""
+    """Of a report; ``inside`` is where the ratio of consistent filters is shown to be.
+
+    Factors of bounds stand in a table of their own.
+    """
+    *first, ratio = BRIEF
     return (
-        *BRIEF,
+        *first,
+        Measure(ratio.column, lambda v: NONE if v.bounds else ratio.cell(v)),
         Measure(Column(f"Shown inside {inside}", f"Shown inside\n{inside}", number=True), shown_inside),
         Measure(Column("Worst axis", "Worst\naxis"), _worst_axis),
         Measure(Column("Mainly"), lambda v: v.subset or NONE),

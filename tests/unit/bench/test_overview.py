@@ -73,7 +73,7 @@ def test_the_picture_has_every_ratio_in_the_row_of_its_world(report):
 def test_what_is_tolerated_is_shaded(report):
     (axes,) = panels(opening(report)[0])
     factor = report.studies[0].tracks[0].verdict.settings.factor
-    (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("tolerated")]
+    (shade,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("consistent if")]
     assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((1.0 / factor, factor))
 
 

@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from edited import change_manifest
 from numpy.testing import assert_allclose, assert_array_equal
-from painted import by_title, lines, panels, places, shaded, titles
+from painted import by_title, legend_of, lines, panels, places, shaded, titles
 from records import changed
 from scipy import stats
 from scripts import figures
@@ -914,7 +914,9 @@ def test_the_forest_has_the_interval_of_each_axis_in_its_row(report):
     labels = ratio_figures.row_labels(found)
     drawn_panels = panels(ratio_figures.by_axis(study)[0])
     assert [label.get_text() for label in drawn_panels[0].get_yticklabels()] == list(labels)
+    right = {"ratio": 1.0, "bias": 0.0, "coverage": 95.45}
     for axes, forest in zip(drawn_panels, found, strict=True):
+        assert lines(axes)[0].get_xdata()[0] == pytest.approx(right[forest.name], abs=0.005)
         for number, track in enumerate(study.tracks):
             (values,) = lines(axes, track.name)
             rows = [(label, row[number]) for label, row in forest.rows]
@@ -934,6 +936,7 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
     assert shaded(axes) == (np.nanmin(common.band), np.nanmax(common.band))
     (band,) = lines(axes, "band of all steps at once")
     assert_array_equal(band.get_ydata(), common.simultaneous[:, 0])
+    assert {"95 % band of one step", "expected", *(track.name for track in study.tracks)} < {*legend_of(axes.figure)}
 
 
 def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(report):
@@ -964,6 +967,9 @@ def test_pose_errors_have_a_row_for_each_filter(report):
         drawn_panels = panels(figure, number)
         assert titles(drawn_panels)[0] == track.name
         of = one_run.pose_error_series(track)
+        stated = track.shown.in_world.errors
+        assert_allclose(of.error[:, 2], np.rad2deg(stated.error[0, :, 2]))
+        assert_allclose(of.sigma[:, 2], np.rad2deg(np.sqrt(stated.covariance[0, :, 2, 2])))
         for axes, error, sigma in zip(drawn_panels, of.error.T, of.sigma.T, strict=True):
             _, low, high, curve = axes.lines
             assert_array_equal(curve.get_ydata(), error)
@@ -974,6 +980,7 @@ def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
     found = one_run.read(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "y (m)")
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     assert_array_equal(truth.get_xydata(), found.truth)
     assert_array_equal(odometry.get_xydata(), found.odometry)

@@ -199,6 +199,13 @@ def test_a_column_that_a_bag_does_not_hold(tmp_path):
             read_recordings(bag, truth_topic=truth, by="v")
 
 
+def test_the_time_since_the_first_row_makes_groups(tmp_path):
+    drive = Drive()
+    bag = write(tmp_path / "drive", 2, "odometry", drive)
+    [r] = read_recordings(bag, truth_topic="map:body", by="t")
+    assert_allclose(r.runs.by[0], drive.t - drive.t[0], atol=1e-6)
+
+
 def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
     drive = Drive()
     drive.t = drive.t.copy()

@@ -450,7 +450,7 @@ def test_files_of_one_name_are_told_apart_by_their_paths(tmp_path, capsys, monke
         (tmp_path / side / "est.csv").write_text("\n".join([head, *lines, ""]))
     files = ["new/est.csv", "old/est.csv"]
     shown, _ = consistency(capsys, "compare", *files, "--truth", tmp_path / "truth.csv")
-    assert f"est of {files[0]} is not found less consistent than est of {files[1]}: 20 runs" in shown
+    assert f"est of {files[0]} is not shown to be less consistent than est of {files[1]}: 20 runs" in shown
     assert f"est of {files[1]} (reference)" in shown
     assert {"RMSE x (m)", "RMSE heading (rad)"} <= {line.split("  ")[0] for line in shown.splitlines()}
     same, _ = consistency(capsys, "compare", files[0], files[0], "--truth", tmp_path / "truth.csv")

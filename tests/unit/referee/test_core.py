@@ -56,7 +56,7 @@ def run(*words):
 
 print(run("analyse", "bold.csv", "--truth", "truth.csv", "--json").replace("\\n", " "))
 print("baseline in" in run("baseline", "old.csv", "--truth", "truth.csv", "--out", "old.json"))
-print("not found less consistent" in run("compare", "est.csv", "old.json", "--truth", "truth.csv"))
+print("not shown to be less consistent" in run("compare", "est.csv", "old.json", "--truth", "truth.csv"))
 print("no alarm" in run("monitor", "est.csv", "--run", "3", "--innovations", "optimal"))
 print("runs" in run("plan", "--dof", "3"))
 """

@@ -427,6 +427,21 @@ def test_a_table_beside_the_estimates(table, tmp_path):
     assert record.groups.index[:3, -1].tolist() == [0, 1, 0]
 
 
+def test_groups_of_a_single_run_are_undecided_in_a_line():
+    """The ratio of each group, and one line on the runs that are missing."""
+    error, covariance = errors(runs=1, steps=400)
+    verdict = cs.judge(error, covariance, by={"t": np.arange(400.0)[None]}, bins=[199.0])
+    assert "all 2 groups by t undecided" in verdict.reasons[0]
+    ratio = np.square(error[0, :200]).mean()
+    assert f"t <= 199: covariance ratio {ratio:.2f}, in 200 steps" in verdict.reasons
+    [advice] = [line for line in verdict.reasons if line.startswith("groups by t are undecided: ")]
+    assert "1 run, too few to see how steps depend on each other (20 are needed); " in advice
+    many, covariance = errors(runs=20, steps=4)
+    verdict = cs.judge(many, covariance, by={"t": np.tile(np.arange(4.0), (20, 1))}, bins=[1.0])
+    assert not any("are undecided" in line for line in verdict.reasons)
+    assert any(line.startswith("t <= 1: covariance ratio ") and "[" in line for line in verdict.reasons)
+
+
 def test_a_trajectory_with_a_table(tmp_path):
     rng, t = np.random.default_rng(9), np.arange(400) / 10.0
     poses = np.column_stack([t, rng.standard_normal((400, 3)), np.zeros((400, 3)), np.ones(400)])
@@ -438,6 +453,7 @@ def test_a_trajectory_with_a_table(tmp_path):
     files = {"truth": tmp_path / "truth.txt", "covariance": tmp_path / "P.txt", "error": "so3"}
     record = cs.read(tmp_path / "est.txt", **files, by="n_matches", by_file=tmp_path / "m.csv")
     assert record.runs.by[0, :4].tolist() == [0.0, 0.0, 2.0, 2.0]
+    assert cs.read(tmp_path / "est.txt", **files, by="t").runs.by[0] == pytest.approx(t)
     with pytest.raises(cs.InputError, match="has no columns of its own; by_file=FILE names a table"):
         cs.read(tmp_path / "est.txt", **files, by="n_matches")
     names = "t,x,y,z,qx,qy,qz,qw,n_matches"

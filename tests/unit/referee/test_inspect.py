@@ -395,6 +395,54 @@ def test_what_is_missing_is_said(which, tmp_path, capsys):
     assert "consistency analyse" not in out
 
 
+STORED = (
+    ("results", "results of 'consistency run'", "consistency analyse {}"),
+    ("findings", "findings of 'consistency reproduce'", "consistency report {} --html report.html"),
+    ("sweep", "sweep over a grid of worlds", "consistency sweep {}"),
+    ("cell", "one world of a sweep", "consistency sweep {}/../.."),
+    ("correction", "correction of 'consistency correct'", "consistency inspect {}/held-out"),
+)
+
+
+@pytest.mark.parametrize("kind, what, line", STORED)
+def test_a_folder_of_the_bench_names_the_command_that_reads_it(kind, what, line, tmp_path, capsys):
+    manifest = {"schema_version": 1, "kind": kind, "command": "consistency it", "filters": ["a", "b"], "runs": 7}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    found = cs.inspect(tmp_path)
+    assert (found.kind, found.command) == (what, line.format(tmp_path))
+    assert dict(found.facts) == {"written by": "consistency it", "filters": "a, b", "runs": "7"}
+    out, _ = consistency(capsys, "inspect", tmp_path, status=0)
+    assert ("To judge it:" if kind == "results" else "To read it:") in out
+
+
+@pytest.mark.parametrize(
+    "kind, said",
+    [("verdict", "holds no estimates; "), ("log", "consistency run --log "), ("new", "holds no estimates")],
+)
+def test_a_folder_that_no_command_judges_says_what_to_do(kind, said, tmp_path, capsys):
+    (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": 1, "kind": kind}))
+    out, err = consistency(capsys, "inspect", tmp_path, status=2)
+    assert said in err
+    assert "To " not in out
+
+
+def test_a_folder_of_a_page_alone(tmp_path, capsys):
+    (tmp_path / "report.html").write_text("")
+    assert "holds no estimates" in consistency(capsys, "inspect", tmp_path, status=2)[1]
+    (tmp_path / "report.html").unlink()
+    assert "no trajectories" in consistency(capsys, "inspect", tmp_path, status=2)[1]
+
+
+def test_a_run_of_a_study_names_its_study(tmp_path):
+    run = tmp_path / "study" / "runs" / "0003"
+    run.mkdir(parents=True)
+    frame = table(np.random.default_rng(1), truth=True)
+    frame[frame["run"] == 0].drop(columns="run").to_csv(run / "est.csv", index=False)
+    data = {"kind": "run of a program", "run": 3, "values": {}, "failure": None, "seconds": 1.0}
+    (run / "run.json").write_text(json.dumps(data))
+    assert any(f"consistency analyse {tmp_path / 'study'} judges all" in each for each in cs.inspect(run).findings)
+
+
 def test_facts_are_shown_where_the_truth_is_missing(tmp_path):
     own, _ = tum(np.random.default_rng(1))
     np.savetxt(tmp_path / "est.tum", own)

@@ -118,6 +118,19 @@ def test_gates_are_summed_up_and_written(session):
     ]  # fmt: skip
 
 
+def test_each_gate_that_fails_has_a_page(session):
+    """Not those that pass, nor those that a test expects to fail; the table names the file."""
+    make(session, THREE)
+    result = session.runpytest("--consistency-pages=look", "--consistency-report=gates.html")
+    names = sorted(path.name for path in (session.path / "look").iterdir())
+    assert names == ["test_it.py-test_bad-1.html", "test_it.py-test_few-1.html"]
+    page = (session.path / "look" / names[0]).read_text()
+    assert "the estimator is overconfident" in page
+    result.stdout.fnmatch_lines([f"page of test_it.py::test_bad: *look?{names[0]}"])
+    result.stdout.no_fnmatch_line("page of test_it.py::test_wanted*")
+    assert f"page: {session.path / 'look' / names[0]}" in (session.path / "gates.html").read_text()
+
+
 def test_no_gates_no_table(session):
     make(session, "def test_without():\n    pass")
     result = session.runpytest("--consistency-report=gates.json")
@@ -191,6 +204,8 @@ def test_the_page_stands_alone(session):
         (["--consistency-report=gates.txt"], "must end in .html or .json or .md or .xml"),
         (["--consistency-report=nowhere/gates.json"], "nowhere does not exist; make it first"),
         (["--consistency-report=folder.json"], "is a folder"),
+        (["--consistency-report=folder.html"], "--consistency-pages *folder.html"),
+        (["--consistency-pages=samples.py"], "--consistency-pages *samples.py: cannot be written"),
         (["--consistency-false-alarm=1.5"], "--consistency-false-alarm must lie between 0 and 1, got 1.5"),
         (["-o", "consistency_false_alarm=few"], "consistency_false_alarm must be a number, got 'few'"),
     ],
@@ -198,6 +213,7 @@ def test_the_page_stands_alone(session):
 def test_unusable_options_stop_before_the_tests(session, options, said):
     make(session, "def test_it():\n    open('ran', 'w').close()")
     (session.path / "folder.json").mkdir()
+    (session.path / "folder.html").mkdir()
     result = session.runpytest(*options)
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines([f"ERROR: *{said}*"])

@@ -150,6 +150,20 @@ def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path, rng):
     assert legend_of(panels(found[3])[0].figure) == ["2 sigma", "run 0"]
 
 
+def test_the_nees_is_drawn_between_the_bands_of_a_right_filter(archive):
+    """The shade is of single steps, the dashes of all at once, the line at the degrees of freedom."""
+    record = cs.read(archive)
+    verdict = cs.judge(record)
+    (axes,) = panels(record_figures(record, verdict)[0])
+    (expected,), (own,) = lines(axes, "expected"), lines(axes, record.name)
+    assert set(expected.get_ydata()) == {2.0}
+    assert_allclose(own.get_ydata(), verdict.scale.anees)
+    assert shaded(axes) == pytest.approx((verdict.scale.band.min(), verdict.scale.band.max()))
+    (low,) = lines(axes, "band of all steps at once")
+    assert_allclose(low.get_ydata(), verdict.location.simultaneous[:, 0])
+    assert legend_of(axes.figure) == ["95 % band of one step", "band of all steps at once", "expected", "mine"]
+
+
 def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
     data = errors_of(rng)
     data["errors"][7] *= 5.0

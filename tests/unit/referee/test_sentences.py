@@ -68,6 +68,30 @@ def test_the_worst_axis_stands_beside_the_whole(rng, capsys):
     assert "worst axis" not in capsys.readouterr().out + str(few)
 
 
+def test_a_fault_that_begins_late_has_its_ratio_over_all_steps_too(rng):
+    """Whatever the false-alarm rate makes of its beginning, the ratio over all steps is the same."""
+    error = independent(rng, 60, 40, 3)
+    error[:, 20:] *= np.sqrt([4.0, 4.0, 9.0])
+    line = {}
+    for rate in (SURE, 0.05):
+        verdict = judged(error, false_alarm=rate)
+        assert verdict.location.since in range(19, 24)
+        [line[rate]] = [text for text in verdict.reasons if text.startswith("covariance ratio of the worst axis")]
+    whole, inside = np.square(error).mean(), np.square(error[:, verdict.location.since - 1 :])
+    assert f"worst axis since step {verdict.location.since}: heading, {inside[..., 2].mean():.2f} [" in line[0.05]
+    assert f"; position {inside[..., :2].mean():.2f} [" in line[0.05]
+    assert "attitude" not in line[0.05]  # which is the worst axis
+    assert f"; all axes {inside.mean():.2f} [" in line[0.05]
+    assert f"], in sigmas x{np.sqrt(inside.mean()):.2f}; over all steps {whole:.2f}" in line[0.05]
+    assert line[SURE].endswith(f"; over all steps {whole:.2f}")
+
+
+def test_a_fault_of_all_steps_has_one_ratio(rng):
+    [line] = [text for text in judged(2.0 * independent(rng, 60, 20, 2)).reasons if "worst axis" in text]
+    assert "over all steps" not in line
+    assert "position" not in line  # of a state without attitude
+
+
 def test_the_worst_axis_of_a_fault_is_to_its_side(rng):
     for factor, status, name in ((4.0, "overconfident", "x"), (0.25, "conservative", "heading")):
         verdict = judged(independent(rng, 60, 10, 3) * np.sqrt(factor * np.array([1.2, 1.0, 0.83])))

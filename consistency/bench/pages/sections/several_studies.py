@@ -168,10 +168,8 @@ def _picture(report: Report) -> Figure:
         figure, (axes,) = canvas(0.5 + 0.22 * len(report.studies))
         axes.set(xlabel=LABEL, xlim=window_of(found, factor))
         name_rows(axes, [study.name for study in report.studies])
-        axes.axvspan(
-            1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.4, label=f"tolerated: 1 / {factor:g} to {factor:g}"
-        )
-        axes.axvline(1.0, **stroke(EXPECTED), label="right")
+        axes.axvspan(1.0 / factor, factor, color=BAND, linewidth=0, zorder=0.4, label="consistent if shown inside")
+        axes.axvline(1.0, **stroke(EXPECTED), label="expected")
         for name in dict.fromkeys(place.track.name for place in found):
             own = [place for place in found if place.track.name == name]
             look = replace(solid(own[0].track.look), size=3.6, width=1.1)

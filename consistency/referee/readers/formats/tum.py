@@ -244,8 +244,13 @@ def _beside_truth(run: SpaceRun, layout: Layout, r: Reading) -> tuple[Poses, str
 
 
 def _own_column(own: Lines, options: GroupOptions) -> Array | None:
-    """Cells of the column of ``--by``, (N,); None where the file has no columns, or the column is of another one."""
+    """Cells of the column of ``--by``, (N,); None where the file has no columns, or the column is of another one.
+
+    A file without a column t has the seconds since its first row in its place.
+    """
     by = options.own_column
+    if by == "t" and "t" not in own.columns:
+        return own.t - own.t[0]
     if by is None or not own.columns:
         return None
     if by not in own.columns:

@@ -24,6 +24,7 @@ LOCAL = {"cluster": "local", "time": 10}
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
     monkeypatch.setattr(slurm, "GLANCE", 0.2)
+    monkeypatch.setattr(slurm.submitit.Job, "_results_timeout_s", 1)  # for what a slow disk may still bring of the dead
 
 
 def on_jobs(folder, work, jobs, runs=RUNS):

@@ -11,10 +11,11 @@ export PYTHONDONTWRITEBYTECODE :=  # byte code is kept: one process compiles a m
 
 # .venv/.lab: what `make reproduce` needs; .venv/.done: that, and what tests, documents and checks need
 VENV_MISSING := $(PYTHON) cannot make a virtual environment, python3-venv is missing; on Debian and Ubuntu: apt install python3-venv
+INSTALL ?= $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 define install
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "$(VENV_MISSING)" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e ".[$(1)]"
+	$(INSTALL) -c constraints.txt -e ".[$(1)]"
 endef
 
 .venv/.lab: pyproject.toml constraints.txt

@@ -182,20 +182,28 @@ def measure(
         pool_file = _kalman_runs(min(wanted, pooled), seed, Path(folder)) if wanted else None
         with ProcessPoolExecutor(workers, initializer=_share, initargs=(pool_file,)) as pool:
             batches = [
-                [
-                    pool.submit(judged, case, range(k, min(k + BATCH, case.gates)), seed)
-                    for k in range(0, case.gates, BATCH)
-                ]
+                [pool.submit(_until_clear, case, seed)]
+                if quick
+                else [pool.submit(judged, case, numbers, seed) for numbers in batches_of(case)]
                 for case in every
             ]
             for case, futures in zip(every, batches, strict=True):
-                outcomes: list[Outcome] = []
-                for future in futures:
-                    if quick and len(outcomes) >= CLEAR and all(map(is_kept_so_far, rows_of_case(case, outcomes))):
-                        future.cancel()
-                    else:
-                        outcomes += future.result()
-                yield from rows_of_case(case, outcomes)
+                yield from rows_of_case(case, [outcome for future in futures for outcome in future.result()])
+
+
+def batches_of(case: Case) -> list[range]:
+    """Numbers of the gates, in order."""
+    return [range(k, min(k + BATCH, case.gates)) for k in range(0, case.gates, BATCH)]
+
+
+def _until_clear(case: Case, seed: int) -> list[Outcome]:
+    """In a worker, which no gates wait for that a row has no need of."""
+    outcomes: list[Outcome] = []
+    for numbers in batches_of(case):
+        outcomes += judged(case, numbers, seed)
+        if len(outcomes) >= CLEAR and all(map(is_kept_so_far, rows_of_case(case, outcomes))):
+            break
+    return outcomes
 
 
 def is_kept_so_far(row: Row) -> bool:

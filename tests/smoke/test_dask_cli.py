@@ -44,7 +44,7 @@ def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(fresh, to_all):
 
 
 def test_a_killed_client_leaves_no_process(fresh):
-    process = begin(fresh, "--backend", "dask")
+    process = begin(fresh, "--backend", "dask", "--jobs", "1")
     wait_for(working(fresh), process)
     process.kill()
     process.communicate()

@@ -5,19 +5,19 @@ there in ``NOT_RUN``; tests/unit/test_documents.py parses that, too, and command
 """
 
 import io
-import os
 import re
 import shlex
-import subprocess
 import sys
 from itertools import groupby
 from pathlib import Path
 
 import document_inputs as inputs
+import forks
 import numpy as np
 import pytest
 import scene
 from documents import PAGES, SHELL, Command, blocks, typed
+from own_process import COMPILING, IMPORTS
 
 from consistency.commands import main
 
@@ -93,7 +93,12 @@ def run_command(command, capsys, monkeypatch):
 
 
 def run_process(*words):
-    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=300, env=os.environ)
+    """A script, or pytest, in a fork."""
+    what = "module('pytest'" if words[0] == "pytest" else "path(sys.argv[0]"
+    code = "import os, runpy; sys.path[0] = os.path.dirname(os.path.abspath(sys.argv[0]))"
+    done = forks.done(
+        IMPORTS, f"{code}; runpy.run_{what}, run_name='__main__')", *words, cwd=Path.cwd(), timeout=COMPILING
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -106,7 +111,7 @@ def run_code(block, names):
         dof = re.search(r"dof=(\d+)", text)
         prelude = inputs.TESTED.format(axes=dof[1] if dof else 3)
         Path("test_block.py").write_text(prelude + text)
-        run_process("-m", "pytest", "-q", "-p", "no:cacheprovider", "test_block.py")
+        run_process("pytest", "-q", "-p", "no:cacheprovider", "test_block.py")
         return
     if saved := re.search(r"Save as `([^`]*)`", block.before):
         Path(saved[1]).write_text(text)
@@ -150,9 +155,9 @@ def test_it_runs(name, found, tmp_path, monkeypatch, capsys):
             if command.words[0] == "consistency":
                 printed += run_command(command, capsys, monkeypatch)
             else:
-                program, *words = command.words
-                assert program in ("python", "pytest"), command
-                run_process(*(["-m", "pytest"] if program == "pytest" else []), *words)
+                words = command.words
+                assert words[0] in ("python", "pytest"), command
+                run_process(*words[words[0] == "python" :])
     if page in PRINTED:
         (shown,) = (block for block in found if block.language == "text" and block.text.startswith(PRINTED[page]))
         assert form(shown.text.splitlines()[0]) in map(form, printed.splitlines())

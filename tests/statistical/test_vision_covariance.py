@@ -22,7 +22,7 @@ from consistency.vision import (
 
 pytestmark = pytest.mark.slow
 
-SAMPLES, CHUNK = 100_000, 10_000
+SAMPLES, CHUNK = 100_000, 500  # which stay in the cache of a processor
 FALSE_ALARM = 1e-5  # of each test
 NOISE, LESS = 0.05, 0.01  # px
 POINTS = 8

@@ -7,6 +7,7 @@ import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import forks
 import grimp
 import pytest
 
@@ -174,13 +175,12 @@ def test_the_package_itself_loads_nothing_heavy():
 
 
 def test_engines_of_clusters_are_loaded_when_they_are_chosen():
-    engines = {"dask", "distributed", "submitit"}
-    choose = "import consistency.bench.runs.montecarlo\n"
-    choose += "from consistency.bench.runs.executors import executor_for\n"
-    choose += "with executor_for({!r}): pass"
-    assert not loaded(choose.format("local")) & engines
-    assert loaded(choose.format("dask")) & engines == {"dask", "distributed"}
-    assert loaded(choose.format("slurm")) & engines == {"submitit"}
+    begin = "import consistency.bench.runs.montecarlo\nfrom consistency.bench.runs.executors import executor_for"
+    choose = "with executor_for(sys.argv[0]): pass\nprint(*{name.split('.')[0] for name in sys.modules})"
+    for name, engines in (("local", set()), ("dask", {"dask", "distributed"}), ("slurm", {"submitit"})):
+        done = forks.done(begin, choose, name, cwd=PACKAGE.parent)
+        assert done.returncode == 0, done.stderr
+        assert {"dask", "distributed", "submitit"} & {*done.stdout.split()} == engines
 
 
 def test_a_new_session_lists_the_public_names():

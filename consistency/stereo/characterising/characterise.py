@@ -362,10 +362,10 @@ class Residuals:
         return np.flatnonzero(np.append(True, np.diff(self.track) != 0)).astype(np.int64)
 
     @property
-    def gap(self) -> Array:
+    def gap(self) -> Indices:
         """Steps since the row before in the track, (N,); 0 in its first."""
-        gap = np.diff(self.step, prepend=self.step[:1]).astype(float)
-        gap[self.first] = 0.0
+        gap = np.diff(self.step, prepend=self.step[:1])
+        gap[self.first] = 0
         return gap
 
 

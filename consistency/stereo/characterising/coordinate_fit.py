@@ -323,7 +323,7 @@ class Rows:
     X: Array  # (N, p), regressors of the bias
     G: Array  # (N, m), weights of the standard deviations at the nodes of disparity
     first: Indices  # (K,), first row of each track
-    gap: Array  # (N,), steps since the row before in the track, 0 in the first
+    gap: Indices  # (N,), steps since the row before in the track, 0 in the first
     ridge: Array  # (p,), 1 / variance of a prior about 0 of each coefficient, mostly 0
 
     @property
@@ -335,7 +335,7 @@ class Rows:
     @property
     def track(self) -> Indices:
         """Number of the track of each row, (N,)."""
-        return np.searchsorted(self.first, np.arange(len(self.r)), side="right") - 1
+        return np.repeat(np.arange(len(self.first)), np.diff(self.first, append=len(self.r)))
 
 
 class Parameters(NamedTuple):
@@ -360,16 +360,17 @@ def whiten_rows(rows: Rows, columns: Array, p: Parameters) -> Whitened | None:
         return None
     root = np.sqrt(np.mean(sd**2) * abs(p.ratio))
     x = np.column_stack([columns, np.ones(len(sd))]) / sd[:, None]
-    decay = np.where(rows.gap > 0, p.rho ** np.maximum(rows.gap, 1), 0.0)
+    decay = p.rho ** np.arange(rows.gap.max() + 1.0)  # over each gap: to look up is faster
+    decay[0] = 0.0
     left = 1.0 - decay**2
-    x[1:] -= decay[1:, None] * x[:-1]
-    x /= np.sqrt(left)[:, None]
+    x[1:] -= decay[rows.gap[1:], None] * x[:-1]
+    x /= np.sqrt(left)[rows.gap, None]
     one = x[:, -1:] * root
     size = np.add.reduceat(one[:, 0] ** 2, rows.first)
     energy = np.sign(p.ratio) * size
     if (energy <= -1.0).any():
         return None
-    of_rows = 2.0 * np.log(sd) + np.log(left)
+    of_rows = 2.0 * np.log(sd) + np.log(left)[rows.gap]
     log_variance = np.add.reduceat(of_rows, rows.first) + np.log1p(energy)
     x = x[:, :-1]
     if root > 0.0:  # (I - k c c')^2 is the inverse of I + s c c'

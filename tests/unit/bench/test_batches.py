@@ -321,7 +321,7 @@ def test_a_pool_that_breaks_keeps_what_is_finished(linear, tmp_path):
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     work = TrialWork(Deadly(trials, (1,), os.getpid()), isolation)
     with (
-        ProcessPoolExecutor(1, get_context("spawn")) as executor,
+        ProcessPoolExecutor(1, get_context("fork")) as executor,
         pytest.raises(cs.InputError, match="the executor has ended"),
     ):
         list(ExecutorWorkers(executor).outcomes(work, [1]))

@@ -24,21 +24,23 @@ LOCAL = {"cluster": "local", "time": 10}
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
     monkeypatch.setattr(slurm, "GLANCE", 0.2)
+    monkeypatch.setattr(slurm.submitit.Job, "_results_timeout_s", 1)  # for what a slow disk may still bring of the dead
 
 
-def on_jobs(folder, work, jobs, runs=RUNS):
-    with SlurmExecutor(folder, LOCAL, jobs) as executor:
+def on_jobs(folder, work, runs):
+    """Of one job at a time."""
+    with SlurmExecutor(folder, LOCAL, 1) as executor:
         outcomes = {outcome.run: outcome for outcome in ExecutorWorkers(executor).outcomes(work, range(runs))}
     assert sorted(outcomes) == list(range(runs))
     return outcomes
 
 
 def require_same(outcomes, work):
-    """Bit by bit, those that have not failed."""
+    """Bit by bit."""
     for expected in LocalThreads(1).outcomes(work, range(len(outcomes))):
         outcome = outcomes[expected.run]
         for column, values in outcome.estimates["kf"].items():
-            assert outcome.failures or values.tobytes() == expected.estimates["kf"][column].tobytes()
+            assert values.tobytes() == expected.estimates["kf"][column].tobytes()
 
 
 def test_the_bytes_are_those_of_local_runs(linear, tmp_path):
@@ -55,7 +57,7 @@ def test_a_job_that_dies_once_is_done_again(linear, tmp_path, capsys):
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
     fuse = tmp_path / "fuse"
     fuse.touch()
-    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (4,), os.getpid(), str(fuse)), isolation), 1)
+    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (1,), os.getpid(), str(fuse)), isolation), 2)
     assert not any(outcome.failures for outcome in outcomes.values())
     require_same(outcomes, TrialWork(trials, isolation))
     assert f"consistency: 1 jobs died; their logs are in {tmp_path / 'jobs'}\n" == capsys.readouterr().err
@@ -64,10 +66,8 @@ def test_a_job_that_dies_once_is_done_again(linear, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_run_that_kills_its_job_has_failed(linear, tmp_path):
     trials, isolation = Simulated(linear, 0), Isolation([cs.get_filter("kf")], linear.belief)
-    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (1,), os.getpid()), isolation), 1, 2)
-    assert [failure.reason for failure in outcomes[1].failures] == ["its worker died (UncompletedJobError)"]
-    assert not outcomes[0].failures
-    require_same(outcomes, TrialWork(trials, isolation))
+    outcomes = on_jobs(tmp_path / "jobs", TrialWork(Deadly(trials, (0,), os.getpid()), isolation), 1)
+    assert [failure.reason for failure in outcomes[0].failures] == ["its worker died (UncompletedJobError)"]
 
 
 def test_an_end_in_the_middle_leaves_nothing(linear, tmp_path, monkeypatch):
@@ -102,12 +102,11 @@ def test_what_waits_is_sent_as_one_array(tmp_path, monkeypatch):
 
     monkeypatch.setattr(slurm.submitit.AutoExecutor, "submit_array", noted)
     with SlurmExecutor(tmp_path / "jobs", LOCAL) as executor:
-        futures = [executor.submit(divmod, number, 3) for number in (7, 8)]
-        broken = executor.submit(divmod, 1, 0)
-        assert [future.result(60) for future in futures] == [(2, 1), (2, 2)]
+        right, broken = executor.submit(divmod, 7, 3), executor.submit(divmod, 1, 0)
+        assert right.result(60) == (2, 1)
         with pytest.raises(Exception, match="ZeroDivisionError"):
             broken.result(60)
-    assert sizes[0] == 3
+    assert sizes[0] == 2
 
 
 @pytest.mark.parametrize(

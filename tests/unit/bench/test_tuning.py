@@ -2,8 +2,7 @@
 
 import json
 import os
-import subprocess
-import sys
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -400,14 +399,13 @@ def test_a_log_is_tuned_to_a_sensor_file(capsys, tmp_path, small):
 # --- the manual --------------------------------------------------------------------------------------
 
 
-def test_the_filterpy_filter_of_the_manual(tmp_path):
+def test_the_filterpy_filter_of_the_manual(tmp_path, capsys):
     script = (ROOT / "docs/examples/tune_my_ekf.py").read_text(encoding="utf-8")
     short = script.replace("runs=20", "runs=2").replace("truth__steps=50", "truth__steps=6")
     assert short != script
     (tmp_path / "mine.py").write_text(short)
-    done = subprocess.run([sys.executable, "mine.py"], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    said = done.stdout.splitlines()
+    runpy.run_path(str(tmp_path / "mine.py"), run_name="__main__")
+    said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("my-ekf on doubtful: fitted by the likelihood of the innovations on 2 runs")
     assert "(sigma: Q.v 0.005 -> " in said[1]
 

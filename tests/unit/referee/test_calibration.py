@@ -1,6 +1,7 @@
 """The calibration of the referee: worlds, how their gates are counted, and the committed table."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -290,10 +291,13 @@ def test_rows_do_not_depend_on_the_number_of_workers():
     assert [row.question for row in one] == ["false alarm", "all-clear"]
 
 
-def test_quick_rows_end_where_nothing_is_doubtful():
+def test_quick_rows_end_where_nothing_is_doubtful(monkeypatch):
+    monkeypatch.setattr(calibration, "ProcessPoolExecutor", ThreadPoolExecutor)
+    monkeypatch.setattr(calibration, "BATCH", 3)
+    monkeypatch.setattr(calibration, "CLEAR", 6)
     of = partial(calibration.measure, seed=5, workers=1)
-    assert list(of([replace(CASE, gates=75)], quick=True)) == list(of([replace(CASE, gates=50)]))
-    wrong = replace(CASE, gates=75, ratio=3.0)
+    assert list(of([replace(CASE, gates=9)], quick=True)) == list(of([replace(CASE, gates=6)]))
+    wrong = replace(CASE, gates=9, ratio=3.0)
     assert list(of([wrong], quick=True)) == list(of([wrong]))
 
 

@@ -52,8 +52,8 @@ def rows_of(rng, tracks, length, sigma=1.0, rho=0.0, tau=0.0):
         e[:, k] = rho * e[:, k - 1] + np.sqrt(1 - rho**2) * e[:, k]
     r = (0.3 + sigma * e + tau * rng.standard_normal((tracks, 1))).ravel()
     first = np.arange(tracks) * length
-    gap = np.ones(len(r))
-    gap[first] = 0.0
+    gap = np.ones(len(r), int)
+    gap[first] = 0
     ones = np.ones((len(r), 1))
     return Rows(r, ones, ones, first, gap, np.zeros(1))
 
@@ -108,8 +108,8 @@ def dense(rows, a, rho, q):
 @pytest.mark.parametrize("rho, q", [(0.0, 0.0), (0.6, 0.0), (-0.3, 0.8), (0.4, -0.02)])
 def test_the_restricted_likelihood_is_that_of_dense_matrices(rng, rho, q):
     first = np.array([0, 5, 6, 14])
-    gap = rng.integers(1, 4, 20).astype(float)
-    gap[first] = 0.0
+    gap = rng.integers(1, 4, 20)
+    gap[first] = 0
     G = rng.dirichlet([1.0, 1.0], 20)
     ridge = np.array([0.0, 0.0, 0.3])
     rows = Rows(rng.standard_normal(20), rng.standard_normal((20, 3)), G, first, gap, ridge)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.models.observation import project, triangulate_jacobian
+from consistency.bench.models import project, triangulate_jacobian
 from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
 from consistency.bench.types import Gaussian

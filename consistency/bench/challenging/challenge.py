@@ -36,8 +36,7 @@ from consistency.bench.runs.results_to_records import analyse
 from consistency.bench.runs.run_outcome import compile_all, first_trials, outcome_of
 from consistency.bench.runs.workers import worker_count
 from consistency.bench.scenario import Scenario, load_scenario, scenario_text
-from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.world import World
+from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics.number_of_runs import gate_runs

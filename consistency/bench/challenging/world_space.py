@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor, misbelief
 from consistency.bench.scenario.truth_and_belief import with_changes
-from consistency.bench.simulation.world import (
+from consistency.bench.simulation import (
     SHAPES,
     Changes,
     baseline_changes,

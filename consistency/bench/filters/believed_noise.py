@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.models import observation
+from consistency.bench import models
 from consistency.bench.scenario import BelievedSensor
 from consistency.referee.types import Array
 
@@ -19,7 +19,7 @@ def sensor_noise(z: Array, sensor: BelievedSensor, converted: bool) -> tuple[Arr
     variance = variance_at(z, sensor)
     if not converted:
         return z, np.broadcast_to(variance, (len(z), *variance.shape[-2:])).copy()
-    points = observation.triangulate(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
+    points = models.triangulate(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
     return np.column_stack(points), point_noise(z, variance, sensor)
 
 
@@ -45,6 +45,6 @@ def disparity_sigma(d: Array, sensor: BelievedSensor) -> Array | float:
 
 def point_noise(z: Array, variance: Array, sensor: BelievedSensor) -> Array:
     """Noise (M, 3, 3) of the points of eq. 21 at pixels z (M, 3) that have a ``variance`` (3, 3) or (M, 3, 3), m^2."""
-    entries = observation.triangulate_jacobian(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
+    entries = models.triangulate_jacobian(z[:, 0], z[:, 1], z[:, 2], sensor.f or 0.0, sensor.B or 0.0)
     J = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(-1, 3, 3)
     return np.asarray(J @ variance @ np.swapaxes(J, 1, 2))

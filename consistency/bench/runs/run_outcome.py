@@ -29,8 +29,7 @@ from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.protocols import Filter, WholeTrial
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.world import World
+from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.bench.store.parquet import Columns, Rejected, truth_columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial

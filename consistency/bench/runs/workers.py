@@ -46,7 +46,7 @@ AT_A_TIME = 1000  # batches of an executor that does not say how many it should 
 SECONDS = 1.5  # after which a batch comes back with what is done of it, where the executor does not say
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on
 # and our own sources
-ROOMS = ("referee/geometry.py", "bench/models", "bench/scenario", "bench/simulation", "bench/filters")
+ROOMS = ("referee/geometry.py", "bench/models.py", "bench/scenario", "bench/simulation.py", "bench/filters")
 
 
 def worker_count(jobs: int) -> int:

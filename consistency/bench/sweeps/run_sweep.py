@@ -45,8 +45,8 @@ KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
 # rooms whose code the numbers of a cell depend on
 CODE = (
-    "referee/diagnostics", "referee/geometry.py", "referee/verdicts", "bench/filters", "bench/models",
-    "bench/runs/run_outcome.py", "bench/runs/montecarlo.py", "bench/scenario", "bench/simulation", "bench/store",
+    "referee/diagnostics", "referee/geometry.py", "referee/verdicts", "bench/filters", "bench/models.py",
+    "bench/runs/run_outcome.py", "bench/runs/montecarlo.py", "bench/scenario", "bench/simulation.py", "bench/store",
 )  # fmt: skip
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried
 SLOW = 1.0  # s, a trial that takes longer is timed once

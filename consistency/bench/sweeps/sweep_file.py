@@ -32,7 +32,7 @@ from consistency.bench.scenario import (
     read_table,
 )
 from consistency.bench.scenario.truth_and_belief import unknown, with_changes
-from consistency.bench.simulation.world import (
+from consistency.bench.simulation import (
     Changes,
     baseline_changes,
     course_of,

@@ -18,8 +18,8 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.models.motion import dead_reckoning
+from consistency.bench import models
+from consistency.bench.models import dead_reckoning
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.recorded_log import write_log
@@ -475,14 +475,14 @@ def misfit(
     packed = mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
     u, v, d = nearest[PIXELS].to_numpy(float).T
-    in_sensor = observation.triangulate(u, v, d, rig.f, rig.baseline)
-    in_robot = observation.from_sensor(*in_sensor, packed)
+    in_sensor = models.triangulate(u, v, d, rig.f, rig.baseline)
+    in_robot = models.from_sensor(*in_sensor, packed)
     x, y, heading = path[nearest["step"]].T
-    places = np.column_stack(observation.to_world(x, y, heading, *in_robot))
+    places = np.column_stack(models.to_world(x, y, heading, *in_robot))
     others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
     targets = places[nearest.index.get_indexer(others["landmark"])]
-    in_robot = observation.to_robot(*path[others["step"]].T, *targets.T)
-    expected = observation.project(*observation.to_sensor(*in_robot, packed), rig.f, rig.baseline)
+    in_robot = models.to_robot(*path[others["step"]].T, *targets.T)
+    expected = models.project(*models.to_sensor(*in_robot, packed), rig.f, rig.baseline)
     error = others[PIXELS].to_numpy(float) - np.column_stack(expected)
     u, v, d = np.sqrt(np.mean(error**2, axis=0)).tolist()
     return u, v, d

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.models.motion import dead_reckoning
+from consistency.bench.models import dead_reckoning
 from consistency.bench.pages.sections.report_input import Study, Track
 from consistency.bench.simulation import simulate
 from consistency.referee.document.blocks import ODOMETRY, SIGMAS, TRUTH, ZERO, Figure, Look, solid

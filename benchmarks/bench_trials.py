@@ -14,7 +14,7 @@ import numpy as np
 
 import consistency as cs
 from consistency.bench import models
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import problem_of
 from consistency.bench.models import dead_reckoning
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates

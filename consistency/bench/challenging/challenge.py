@@ -27,9 +27,8 @@ from scipy.stats import qmc
 from consistency.bench.challenging.world_space import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import name_of
 from consistency.bench.filters.run_filter import resolve_filters
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, name_of
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import analyse

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.filters import filter_names, get_filter, usable_names
-from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, random_numbers, rejects
+from consistency.bench.filters.filter_inputs import problem_for, random_numbers
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.protocols import Filter, WholeTrial, error_of, name_of, rejects
 from consistency.bench.scenario import Belief
 from consistency.bench.scenario.toml_tables import UNITS
 from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial

@@ -27,8 +27,8 @@ import joblib
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
 from consistency.bench.filters.run_filter import RunRecord, reason_of
+from consistency.bench.protocols import error_of, name_of, rejects
 from consistency.bench.runs.run_outcome import Outcomes, Recorded, RunOutcome, TrialWork, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from consistency.bench import models
-from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.filter_inputs import sensor_noise
 from consistency.bench.filters.kernel import part_functions
 from consistency.bench.filters.kernel.part_functions import State
 from consistency.bench.filters.kernel.update_steps import (

@@ -25,9 +25,8 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import answer, build_report, compose
 from consistency.bench.pages.sections import (
-    anees,
     calibration_rates,
-    nees_distribution,
+    nees,
     nis,
     one_run,
 )
@@ -196,7 +195,7 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(one_run.pose_error_series, study.tracks),
+        nees.read(study).curves, map(one_run.pose_error_series, study.tracks),
         one_run.read(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
@@ -267,7 +266,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
         assert by_name["ratio"][ratio_figures.WHOLE][number] == v.scale.inflation
         assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * v.accuracy.coverage_one_step[1])
         assert by_name["bias"]["heading"][number] == v.bias.by_axis["heading"]
-        of = nees_distribution.steps(track)
+        of = nees.steps(track)
         assert_array_equal(of.x[1:-1], v.tails.pit)
         assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
         assert nis.lags(track) is None  # four runs of 60 steps have too few innovations
@@ -347,7 +346,7 @@ def test_nees_alone_without_axes(report):
 def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
-    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.anees_caption(anees.read(report.studies[0]))
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in nees.anees_caption(nees.read(report.studies[0]))
     assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
         verdicts.method(report.studies)
@@ -533,7 +532,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert study.until_decided
     assert (kf.verdict.runs, wrong.verdict.runs) == (24, 12)
     assert wrong.verdict.status == "overconfident"
-    curves = anees.read(study)
+    curves = nees.read(study)
     assert curves.common.track is kf
     assert [curve.own_band for curve in curves.curves] == [False, True]
     assert study.failures == [("small", 20, 30, "diverged")]  # after the look that decided, and still listed
@@ -541,7 +540,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     first = results.estimates[results.estimates["run"] < 12].groupby("step")
     assert_allclose(study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan))
     assert "kf after 24 runs and small after 12 runs" in verdicts.verdicts_caption(study)
-    assert "Average NEES over 24 runs" in anees.anees_caption(anees.read(study))
+    assert "Average NEES over 24 runs" in nees.anees_caption(nees.read(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
     assert "asks scale alone" in questions_table.marks_caption(study)
@@ -554,8 +553,8 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
         judge(make_record("any", error[:runs], P[:runs], failures=failures))
         for runs, failures in ((24, lost), (12, ()), (24, ()))
     )
-    assert anees.common({"early": early, "late": late}) is late
-    assert anees.common({"late": late, "whole": whole, "early": early}) is whole
+    assert nees.common({"early": early, "late": late}) is late
+    assert nees.common({"late": late, "whole": whole, "early": early}) is whole
 
 
 def test_runs_of_a_fixed_number_say_nothing_of_looks(report):
@@ -757,10 +756,10 @@ def test_only_failed_runs_give_a_filter_bands_of_its_own(results, tmp_path):
         tmp_path / "run"
     )
     report = build_report(tmp_path / "run")
-    curves = anees.read(report.studies[0])
+    curves = nees.read(report.studies[0])
     assert [curve.own_band for curve in curves.curves] == [True, False]
     assert curves.common.track.name == "ekf-uvd"
-    assert "Fewer runs carry the curve of ekf-xyz" in anees.anees_caption(curves)
+    assert "Fewer runs carry the curve of ekf-xyz" in nees.anees_caption(curves)
 
 
 def test_html_loads_nothing_and_is_small(page_of_results):
@@ -930,7 +929,7 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
         (curve,) = lines(axes, track.name)
         assert_array_equal(curve.get_ydata(), track.verdict.scale.anees)
         assert curve.get_gid() == f"filter:{track.tag}"
-    common = anees.read(study).common
+    common = nees.read(study).common
     assert shaded(axes) == (np.nanmin(common.band), np.nanmax(common.band))
     (band,) = lines(axes, "band of all steps at once")
     assert_array_equal(band.get_ydata(), common.simultaneous[:, 0])
@@ -945,16 +944,16 @@ def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(repo
     verdict = replace(track.verdict, scale=scale)
     far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
     with_far = replace(study, tracks=(far, *study.tracks[1:]))
-    curves = anees.read(with_far).curves
+    curves = nees.read(with_far).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
     others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
     assert_allclose(curves[0].others, others.filled(np.nan))
-    (figure,) = anees.anees_curves(with_far)
+    (figure,) = nees.anees_curves(with_far)
     assert f" 2 runs of {verdict.runs} decide the average of {track.name}, 4321 over all steps" in figure.caption
     (axes,) = panels(figure)
     (thin,) = lines(axes, f"{track.name} without 2 runs")
     assert_array_equal(thin.get_ydata(), curves[0].others)
-    assert "decide" not in anees.anees_caption(anees.read(study))
+    assert "decide" not in nees.anees_caption(nees.read(study))
 
 
 def test_pose_errors_have_a_row_for_each_filter(report):

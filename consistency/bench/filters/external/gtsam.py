@@ -39,8 +39,7 @@ import gtsam
 import numpy as np
 
 from consistency.bench import models
-from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import bias_at, disparity_sigma, problem_of
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import heading_matrix, mounted

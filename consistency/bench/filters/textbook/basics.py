@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from consistency.bench import models
-from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.filter_inputs import sensor_noise
 from consistency.bench.protocols import Problem
 from consistency.bench.scenario import PLANAR_SENSORS, Belief, BelievedSensor
 from consistency.bench.types import Control, Gaussian, Info, Observation

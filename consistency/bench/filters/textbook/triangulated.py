@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from consistency.bench import models
-from consistency.bench.filters.believed_noise import disparity_sigma, point_noise, variance_at
+from consistency.bench.filters.filter_inputs import disparity_sigma, point_noise, variance_at
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.ekf import ExtendedKalman

@@ -256,7 +256,7 @@ class Gathered:
         with Writer(new.path / f"{table}.parquet", table, columns) as writer:
             for name in names:
                 for piece in self.pieces(table, name):
-                    writer.add(piece, filter=name)
+                    writer.add(piece, name)
                 writer.end_group()
 
     def _before(self, table: str, filter_name: str) -> Iterator[tuple[int, Columns]]:

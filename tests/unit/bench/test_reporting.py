@@ -195,8 +195,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        nees.read(study).curves, map(one_run.pose_error_series, study.tracks),
-        one_run.read(study).paths, strict=True,
+        nees.anees_of(study).curves, map(one_run.pose_error_series, study.tracks),
+        one_run.world_of(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -216,9 +216,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    assert_array_equal(one_run.read(study).truth, trial.truth[:, :2])
+    assert_array_equal(one_run.world_of(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = one_run.read(study).odometry
+    odometry = one_run.world_of(study).odometry
     assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -346,7 +346,9 @@ def test_nees_alone_without_axes(report):
 def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
-    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in nees.anees_caption(nees.read(report.studies[0]))
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in nees.anees_caption(
+        nees.anees_of(report.studies[0])
+    )
     assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
         verdicts.method(report.studies)
@@ -532,7 +534,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert study.until_decided
     assert (kf.verdict.runs, wrong.verdict.runs) == (24, 12)
     assert wrong.verdict.status == "overconfident"
-    curves = nees.read(study)
+    curves = nees.anees_of(study)
     assert curves.common.track is kf
     assert [curve.own_band for curve in curves.curves] == [False, True]
     assert study.failures == [("small", 20, 30, "diverged")]  # after the look that decided, and still listed
@@ -540,7 +542,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     first = results.estimates[results.estimates["run"] < 12].groupby("step")
     assert_allclose(study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan))
     assert "kf after 24 runs and small after 12 runs" in verdicts.verdicts_caption(study)
-    assert "Average NEES over 24 runs" in nees.anees_caption(nees.read(study))
+    assert "Average NEES over 24 runs" in nees.anees_caption(nees.anees_of(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
     assert "asks scale alone" in questions_table.marks_caption(study)
@@ -741,7 +743,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(one_run.read(study).paths[1][1]).any()
+    assert not np.isfinite(one_run.world_of(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -756,7 +758,7 @@ def test_only_failed_runs_give_a_filter_bands_of_its_own(results, tmp_path):
         tmp_path / "run"
     )
     report = build_report(tmp_path / "run")
-    curves = nees.read(report.studies[0])
+    curves = nees.anees_of(report.studies[0])
     assert [curve.own_band for curve in curves.curves] == [True, False]
     assert curves.common.track.name == "ekf-uvd"
     assert "Fewer runs carry the curve of ekf-xyz" in nees.anees_caption(curves)
@@ -929,7 +931,7 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
         (curve,) = lines(axes, track.name)
         assert_array_equal(curve.get_ydata(), track.verdict.scale.anees)
         assert curve.get_gid() == f"filter:{track.tag}"
-    common = nees.read(study).common
+    common = nees.anees_of(study).common
     assert shaded(axes) == (np.nanmin(common.band), np.nanmax(common.band))
     (band,) = lines(axes, "band of all steps at once")
     assert_array_equal(band.get_ydata(), common.simultaneous[:, 0])
@@ -944,7 +946,7 @@ def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(repo
     verdict = replace(track.verdict, scale=scale)
     far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
     with_far = replace(study, tracks=(far, *study.tracks[1:]))
-    curves = nees.read(with_far).curves
+    curves = nees.anees_of(with_far).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
     others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
     assert_allclose(curves[0].others, others.filled(np.nan))
@@ -953,7 +955,7 @@ def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(repo
     (axes,) = panels(figure)
     (thin,) = lines(axes, f"{track.name} without 2 runs")
     assert_array_equal(thin.get_ydata(), curves[0].others)
-    assert "decide" not in nees.anees_caption(nees.read(study))
+    assert "decide" not in nees.anees_caption(nees.anees_of(study))
 
 
 def test_pose_errors_have_a_row_for_each_filter(report):
@@ -971,7 +973,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = one_run.read(study)
+    found = one_run.world_of(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
     assert_array_equal(truth.get_xydata(), found.truth)
@@ -1048,7 +1050,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert one_run.read(study).odometry is None
+    assert one_run.world_of(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

@@ -52,9 +52,9 @@ def test_both_errors_stand_below_each_other(study):
 
 def test_captions_name_the_filters_with_an_error_of_their_own(study):
     assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.verdicts_caption(study)
-    assert nees.anees_caption(nees.read(study)).endswith("In the filter's own error: right (right).")
+    assert nees.anees_caption(nees.anees_of(study)).endswith("In the filter's own error: right (right).")
     alone = replace(study, tracks=study.tracks[:1])
-    assert "own" not in nees.anees_caption(nees.read(alone)).replace("shown", "")
+    assert "own" not in nees.anees_caption(nees.anees_of(alone)).replace("shown", "")
     assert "error of their own" not in verdicts.verdicts_caption(alone)
     assert own_error_table(alone) == ()
 

@@ -68,20 +68,20 @@ class Anees:
         return next((curve for curve in self.curves if not curve.own_band), None)
 
 
-def read(study: Study) -> Anees | None:
+def anees_of(study: Study) -> Anees | None:
     """Curves and bands of the verdicts; None where the truth is not known."""
     if not study.has_truth:
         return None
-    shared = common({track.name: track.verdict for track in study.tracks})
-    return Anees(study, tuple(_curve(t, shared) for t in study.tracks if t.verdict.scale is not None))
-
-
-def _curve(track: Track, shared: Verdict | None) -> Curve:
-    scale, location = track.verdict.scale, track.verdict.location
-    assert scale is not None
-    simultaneous = None if location is None else location.simultaneous
-    others, far = _without_far_runs(track, scale)
-    return Curve(track, scale.anees, scale.band, simultaneous, _fewer(track.verdict, shared), others, far)
+    shared, curves = common({track.name: track.verdict for track in study.tracks}), []
+    for track in study.tracks:
+        scale, location = track.verdict.scale, track.verdict.location
+        if scale is not None:
+            simultaneous = None if location is None else location.simultaneous
+            own_band = _fewer(track.verdict, shared)
+            curves.append(
+                Curve(track, scale.anees, scale.band, simultaneous, own_band, *_without_far_runs(track, scale))
+            )
+    return Anees(study, tuple(curves))
 
 
 def _without_far_runs(track: Track, scale: Scale) -> tuple[Array | None, int]:
@@ -111,7 +111,7 @@ def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
 
 def anees_curves(study: Study) -> tuple[Figure, ...]:
     """The curve of each filter with the band of the study; nothing where the truth is not known."""
-    anees = read(study)
+    anees = anees_of(study)
     if anees is None:
         return ()
     name = f"{study.statistic} of the pose"
@@ -161,9 +161,11 @@ def anees_caption(anees: Anees) -> str:
         if own
         else ""
     )
+    own_errors = names_in_a_row(study.own_errors)
+    error = f" In the filter's own error: {own_errors}." if own_errors else ""
     return (
         f"{what}; {expected} is expected (line). Shaded: 95 % of single steps of a right filter (eq. 17); for "
-        f"orientation only.{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
+        f"orientation only.{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{error}"
         f"{''.join(map(_told, anees.curves))}"
     )
 
@@ -179,12 +181,6 @@ def _told(curve_of: Curve) -> str:
         f"steps: {short(scale.worst_run)} in the worst run and {short(scale.median_run)} in the median run. Thin: "
         f"without {'it' if curve_of.far == 1 else 'them'}."
     )
-
-
-def _own(anees: Anees) -> str:
-    """Whose NEES is that of another error than the additive one."""
-    own = anees.study.own_errors
-    return f" In the filter's own error: {names_in_a_row(own)}." if own else ""
 
 
 def _simultaneous(anees: Anees) -> str:

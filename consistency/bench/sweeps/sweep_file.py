@@ -399,9 +399,9 @@ class Axis:
         return QUANTITIES[self.key].unit if self.key in QUANTITIES else ""
 
     @property
-    def label(self) -> str:
-        """For the axis of a figure or the head of a column."""
-        return f"{self.text} ({self.unit})" if self.unit else self.text
+    def short(self) -> str:
+        """Last part of the key."""
+        return self.key.rpartition(".")[2]
 
     @property
     def numeric(self) -> bool:

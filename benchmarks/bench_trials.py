@@ -15,7 +15,6 @@ import numpy as np
 import consistency as cs
 from consistency.bench import models
 from consistency.bench.filters.filter_inputs import problem_of
-from consistency.bench.models import dead_reckoning
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates
 from consistency.referee.types import Array
@@ -91,7 +90,7 @@ def _drive(velocities: Array, belief: Belief, rng: np.random.Generator) -> tuple
     planned = np.column_stack([np.full(len(velocities), 0.1), velocities])
     controls = planned.copy()
     controls[:, 1:] += rng.standard_normal(velocities.shape) * [belief.motion.sigma_v, belief.motion.sigma_omega]
-    return dead_reckoning(np.zeros(3), planned), controls
+    return models.dead_reckoning(np.zeros(3), planned), controls
 
 
 def _observed(

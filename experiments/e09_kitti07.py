@@ -24,7 +24,6 @@ import pandas as pd
 
 import consistency as cs
 from consistency.bench import models
-from consistency.bench.models import dead_reckoning
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.runs.results_to_records import record_of
@@ -100,7 +99,7 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
     heading, move = trial.truth[:-1, 2], np.diff(trial.truth[:, :2], axis=0)
     speed = (move[:, 0] * np.cos(heading) + move[:, 1] * np.sin(heading)) / dt
     exact = np.column_stack([dt, speed, np.diff(trial.truth[:, 2]) / dt])
-    path = dead_reckoning(trial.start, exact)
+    path = models.dead_reckoning(trial.start, exact)
     pose = path[trial.step]
     _, born = np.unique(trial.landmark, return_index=True)
     (u, v, d), (x, y, heading) = trial.z[born].T, pose[born].T

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from consistency.bench import models
-from consistency.bench.models import dead_reckoning
 from consistency.bench.scenario import (
     AnnularLandmarks,
     Circle,
@@ -300,7 +299,7 @@ def start_pose(truth: Truth) -> Array:
 
 def planned_path(truth: Truth) -> Array:
     """Poses 0..steps of the path without any noise, shape (steps + 1, 3)."""
-    return dead_reckoning(start_pose(truth), planned_controls(truth))
+    return models.dead_reckoning(start_pose(truth), planned_controls(truth))
 
 
 def lap_length(path: Path_) -> float:

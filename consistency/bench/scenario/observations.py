@@ -25,7 +25,6 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from consistency.bench import models
-from consistency.bench.models import Mounting
 from consistency.bench.scenario.toml_tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array, Indices
@@ -398,9 +397,9 @@ class Mount(Table):
     position: Triple = (0.0, 0.0, 0.0)
     rotation: Triple = (0.0, 0.0, 0.0)  # roll, pitch, heading
 
-    def packed(self) -> Mounting:
+    def packed(self) -> models.Mounting:
         """Position and rotation matrix, as the models take it."""
-        return Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
+        return models.Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
 
 
 class Sensor(Table):

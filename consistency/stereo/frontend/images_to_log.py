@@ -19,7 +19,6 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.bench import models
-from consistency.bench.models import dead_reckoning
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
 from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.recorded_log import write_log
@@ -561,7 +560,7 @@ def planar_path(motions: Array) -> Array:
     """Poses x, y, heading (T + 1, 3) from :func:`planar_motions`, from the origin on; the heading is not wrapped."""
     forward, left, turn = motions.T
     controls = np.column_stack([np.ones(len(motions)), forward, turn])
-    path = dead_reckoning(np.zeros(3), controls)
+    path = models.dead_reckoning(np.zeros(3), controls)
     heading = path[:-1, 2]
     path[1:, 0] -= np.cumsum(left * np.sin(heading))
     path[1:, 1] += np.cumsum(left * np.cos(heading))

@@ -649,7 +649,7 @@ def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_w
     path.write_text(json.dumps(CALIBRATION))
     found = calibration_rates.calibration(path)
     assert found.gates == 600
-    (first, (alarm,)), (second, (power, decided)) = calibration_rates.groups(found)
+    (first, (alarm,)), (second, (power, decided)) = calibration_rates.promise_groups(found)
     assert (first, second) == ("false alarm: a right filter is found at fault", "power: plan keeps its word")
     # Clopper & Pearson of 9 in 200 at 99 %
     low, high = stats.beta.ppf(0.005, 9, 192), stats.beta.ppf(0.995, 10, 191)

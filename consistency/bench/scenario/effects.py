@@ -25,6 +25,7 @@ from consistency.bench.scenario.observations import (
     Observations,
     UvdEffect,
     register_effect,
+    require_search_range,
 )
 from consistency.bench.scenario.toml_tables import Count, Finite, NonNegative, Positive, Rate
 from consistency.referee.types import Array, Indices
@@ -167,8 +168,8 @@ class Mismatch(UvdEffect):
 
     @model_validator(mode="after")
     def _is_a_range(self) -> Mismatch:
-        if self.disparity is not None and self.disparity[0] >= self.disparity[1]:
-            raise ValueError("disparity must be [low, high] with low < high")
+        if self.disparity is not None:
+            require_search_range(self.disparity)
         return self
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:

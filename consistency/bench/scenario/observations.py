@@ -268,6 +268,12 @@ def register_effect(effect: type[E]) -> type[E]:
     return effect
 
 
+def require_search_range(disparity: tuple[float, float]) -> None:
+    """Refuse a range of disparities whose ends are not in order."""
+    if disparity[0] >= disparity[1]:
+        raise ValueError("disparity must be [low, high] with low < high")
+
+
 def require_increasing(key: str, nodes: tuple[float, ...]) -> None:
     """Refuse nodes of a table that are not in increasing order; raises ValueError."""
     if not all(a < b for a, b in pairwise(nodes)):

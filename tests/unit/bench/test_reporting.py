@@ -940,15 +940,15 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
 def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(report):
     (study,) = report.studies
     track = study.tracks[0]
-    nees = track.record().errors.nees.copy()
-    nees[[0, 2]] *= 1e4
+    far_nees = track.record().errors.nees.copy()
+    far_nees[[0, 2]] *= 1e4
     scale = replace(track.verdict.scale, median_run=2.5, worst_run=3e4, mean_anees=4321.0)
     verdict = replace(track.verdict, scale=scale)
-    far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
+    far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=far_nees))
     with_far = replace(study, tracks=(far, *study.tracks[1:]))
     curves = nees.anees_of(with_far).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
-    others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
+    others = np.ma.masked_invalid(np.delete(far_nees, [0, 2], axis=0)).mean(axis=0)
     assert_allclose(curves[0].others, others.filled(np.nan))
     (figure,) = nees.anees_curves(with_far)
     assert f" 2 runs of {verdict.runs} decide the average of {track.name}, 4321 over all steps" in figure.caption

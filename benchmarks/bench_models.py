@@ -6,8 +6,7 @@ import numpy as np
 from bench_trials import Case, twin_state
 
 from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians, pose_after, process_noise
-from consistency.bench.models import observation
-from consistency.bench.scenario import Belief
+from consistency.bench.scenario import Belief, models
 from consistency.bench.types import Control
 from consistency.referee.types import Array
 
@@ -38,8 +37,8 @@ class Models:
     def H(self, x: Array, at: Array) -> Array:
         """Jacobian (3 m, n) of h."""
         s, m = self.sensor, len(at)
-        bx, by, bz = observation.to_robot(*x[:3], *x[at].T)
-        J = observation.project_jacobian(*observation.to_sensor(bx, by, bz, s.mount), s.f, s.B)
+        bx, by, bz = models.to_robot(*x[:3], *x[at].T)
+        J = models.project_jacobian(*models.to_sensor(bx, by, bz, s.mount), s.f, s.B)
         turned = np.stack(np.broadcast_arrays(*J), axis=-1).reshape(m, 3, 3) @ s.turn.T
         c, sn = np.cos(x[2]), np.sin(x[2])
         to_robot = np.array([[c, sn, 0.0], [-sn, c, 0.0], [0.0, 0.0, 1.0]])

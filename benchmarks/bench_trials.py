@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import problem_of
-from consistency.bench.models import observation
-from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.scenario import Belief
+from consistency.bench.filters.filter_inputs import problem_of
+from consistency.bench.scenario import Belief, models
 from consistency.bench.types import Estimates
 from consistency.referee.types import Array
 
@@ -91,7 +89,7 @@ def _drive(velocities: Array, belief: Belief, rng: np.random.Generator) -> tuple
     planned = np.column_stack([np.full(len(velocities), 0.1), velocities])
     controls = planned.copy()
     controls[:, 1:] += rng.standard_normal(velocities.shape) * [belief.motion.sigma_v, belief.motion.sigma_omega]
-    return dead_reckoning(np.zeros(3), planned), controls
+    return models.dead_reckoning(np.zeros(3), planned), controls
 
 
 def _observed(
@@ -100,9 +98,9 @@ def _observed(
     counts = np.array([len(view) for view in views])
     landmark, step = np.concatenate(views), np.repeat(np.arange(len(views)), counts)
     sensor = belief.sensor
-    body = observation.to_robot(*path[step + 1].T, *true[landmark].T)
-    c = observation.to_sensor(*body, sensor.mount.packed())
-    z = np.column_stack(observation.project(*c, sensor.f or 0.0, sensor.B or 0.0) if sensor.model == "uvd" else c)
+    body = models.to_robot(*path[step + 1].T, *true[landmark].T)
+    c = models.to_sensor(*body, sensor.mount.packed())
+    z = np.column_stack(models.project(*c, sensor.f or 0.0, sensor.B or 0.0) if sensor.model == "uvd" else c)
     z += rng.standard_normal(z.shape) * np.array(sensor.sigma)
     first = np.concatenate([[0], np.cumsum(counts)])
     return Case(cs.Trial(0, path[0], controls, first, landmark, z, len(true), path), belief)

@@ -25,7 +25,7 @@ from consistency.bench.challenging.challenge import Plan, challenge
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler.jit import Outlook
 from consistency.bench.filters.methods.ekf import parts
-from consistency.bench.models.motion import dead_reckoning, unicycle_jacobian, unicycle_noise
+from consistency.bench.scenario.models import dead_reckoning, unicycle_jacobian, unicycle_noise
 from consistency.bench.types import Estimates
 
 SURE = 0.01  # probability that a rate exactly as stated is called broken

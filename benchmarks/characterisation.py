@@ -19,8 +19,7 @@ import numpy as np
 from script_options import options_of
 
 import consistency as cs
-from consistency.bench.models import observation
-from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor
+from consistency.bench.scenario import PicturedSensor, Scenario, UvdSensor, models
 from consistency.bench.scenario.observations import BiasMap, DisparityGrowth
 from consistency.bench.simulation import World
 from consistency.bench.types import Trial
@@ -64,8 +63,8 @@ def _changed(trial: Trial, scenario: Scenario, of: Real) -> Trial:
     assert trial.truth is not None
     assert trial.landmarks is not None
     step = trial.step
-    body = observation.to_robot(*trial.truth[step].T, *trial.landmarks[trial.landmark].T)
-    ideal = np.stack(observation.project(*observation.to_sensor(*body, sensor.mount.packed()), *sensor.rig), axis=-1)
+    body = models.to_robot(*trial.truth[step].T, *trial.landmarks[trial.landmark].T)
+    ideal = np.stack(models.project(*models.to_sensor(*body, sensor.mount.packed()), *sensor.rig), axis=-1)
     noise = trial.z - ideal
     if of.growth is not None:
         noise[:, 2] *= of.growth.ratio_at(ideal[:, 2])

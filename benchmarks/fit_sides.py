@@ -17,14 +17,14 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from fit_covariance import matrices_of
 from scipy import stats
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation
 from script_options import options_of
 
 from consistency.referee.fit_covariance.drives import Drive, cut_windows, span_of
 from consistency.referee.fit_covariance.mean_and_noise import MeanFit, fit_noise, jitter_of
-from consistency.referee.geometry import composed, matrices
+from consistency.referee.geometry import composed
 from consistency.referee.types import Array
 
 STEP, LENGTH = 0.05, 120.0  # m
@@ -65,13 +65,6 @@ def coloured(rng: np.random.Generator, size: tuple[int, int], lasts: float) -> A
     return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
 
 
-def poses(motions: Array) -> Array:
-    """Matrices of x, y, heading (N, 3), or of a position and a rotation vector (N, 6)."""
-    if motions.shape[1] == 6:
-        motions = np.column_stack([motions[:, :3], Rotation.from_rotvec(motions[:, 3:]).as_quat()])
-    return matrices(motions)
-
-
 def drive(rng: np.random.Generator, side: Side, name: str) -> Drive:
     n, d = round(LENGTH / STEP), 3 if side.in_space else 2
     x, y, yaw = SIGMA
@@ -81,8 +74,11 @@ def drive(rng: np.random.Generator, side: Side, name: str) -> Drive:
     way = np.zeros((n, d))
     way[:, 0] = STEP
     sigma = np.array([x, *[y] * (d - 1), *(yaw * share)])
-    noise = poses(np.sqrt(STEP) * sigma * rng.normal(size=(n, len(sigma))))
-    true, estimated = poses(np.column_stack([way, turns])), poses(np.column_stack([way, turns / side.scale]))
+    noise = matrices_of(np.sqrt(STEP) * sigma * rng.normal(size=(n, len(sigma))))
+    true, estimated = (
+        matrices_of(np.column_stack([way, turns])),
+        matrices_of(np.column_stack([way, turns / side.scale])),
+    )
     if side.of_odometry:
         estimated = estimated @ noise
     else:
@@ -90,12 +86,12 @@ def drive(rng: np.random.Generator, side: Side, name: str) -> Drive:
     if side.drifts:
         rates = np.zeros((n, len(sigma)))
         rates[:, -1] = STEP * DRIFT * coloured(rng, (n, 1), DRIFTS)[:, 0]
-        true = true @ poses(rates)
+        true = true @ matrices_of(rates)
     start = np.eye(d + 1)[None]
     truth, estimate = (composed(np.concatenate([start, each])) for each in (true, estimated))
     if side.jitters:
         ends = np.sqrt(0.5 * JITTER) * np.append(np.full(d, yaw), yaw * share)
-        truth = truth @ poses(ends * rng.normal(size=(n + 1, len(sigma))))
+        truth = truth @ matrices_of(ends * rng.normal(size=(n + 1, len(sigma))))
     return Drive(name, STEP * np.arange(n + 1), np.arange(n + 1), estimate, truth)
 
 

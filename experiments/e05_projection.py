@@ -10,8 +10,8 @@ import pandas as pd
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.models.observation import project, triangulate, triangulate_jacobian
 from consistency.bench.runs.reproduce_findings import script
+from consistency.bench.scenario.models import project, triangulate, triangulate_jacobian
 from consistency.diagnostics import Normality, normality
 from consistency.referee.types import Array
 

@@ -23,11 +23,10 @@ import numpy as np
 import pandas as pd
 
 import consistency as cs
-from consistency.bench.models import observation
-from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.runs.montecarlo import run_log
 from consistency.bench.runs.reproduce_findings import command_line, sibling
 from consistency.bench.runs.results_to_records import record_of
+from consistency.bench.scenario import models
 from consistency.bench.store.recorded_log import Log, write_log
 from consistency.bench.store.results import Results, joined
 from consistency.bench.types import Trial
@@ -100,14 +99,14 @@ def white_twin(trial: Trial, belief: Any, rng: np.random.Generator) -> Trial:
     heading, move = trial.truth[:-1, 2], np.diff(trial.truth[:, :2], axis=0)
     speed = (move[:, 0] * np.cos(heading) + move[:, 1] * np.sin(heading)) / dt
     exact = np.column_stack([dt, speed, np.diff(trial.truth[:, 2]) / dt])
-    path = dead_reckoning(trial.start, exact)
+    path = models.dead_reckoning(trial.start, exact)
     pose = path[trial.step]
     _, born = np.unique(trial.landmark, return_index=True)
     (u, v, d), (x, y, heading) = trial.z[born].T, pose[born].T
-    seen = observation.from_sensor(*observation.triangulate(u, v, d, sensor.f, sensor.B), mount)
-    place = np.column_stack(observation.to_world(x, y, heading, *seen))[trial.landmark]
-    back = observation.to_sensor(*observation.to_robot(*pose.T, *place.T), mount)
-    z = np.column_stack(observation.project(*back, sensor.f, sensor.B)) + rng.normal(size=trial.z.shape) * sensor.sigma
+    seen = models.from_sensor(*models.triangulate(u, v, d, sensor.f, sensor.B), mount)
+    place = np.column_stack(models.to_world(x, y, heading, *seen))[trial.landmark]
+    back = models.to_sensor(*models.to_robot(*pose.T, *place.T), mount)
+    z = np.column_stack(models.project(*back, sensor.f, sensor.B)) + rng.normal(size=trial.z.shape) * sensor.sigma
     noise = rng.normal(size=exact.shape) * [0.0, belief.motion.sigma_v, belief.motion.sigma_omega]
     return replace(trial, controls=exact + noise, z=z, truth=path)
 

@@ -11,8 +11,8 @@ import pandas as pd
 import consistency as cs
 from consistency.bench.filters import filter_names, get_filter
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import is_realisable
 from consistency.bench.filters.run_filter import run_filter
+from consistency.bench.protocols import is_realisable
 from consistency.bench.runs.reproduce_findings import OURS, script
 
 FINDINGS = ("consistent-map", "cost-of-consistency")

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from consistency.bench.models import observation
-from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, models
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
@@ -125,7 +124,7 @@ def misfit(data: Recording, t: Array, landmark: Indices, z: Array) -> Array:
     """Measured less true range and bearing (M, 2)."""
     x, y, heading = data.pose(t).T
     dx, dy = (data.landmarks[landmark] - np.column_stack([x, y])).T
-    distance, direction = observation.range_bearing(dx, dy)
+    distance, direction = models.range_bearing(dx, dy)
     turn = z[:, 1] - (direction - heading)
     return np.column_stack([z[:, 0] - distance, (turn + np.pi) % (2 * np.pi) - np.pi])
 
@@ -217,5 +216,5 @@ def _calibrated(data: Recording, found: Calibration, t: Array) -> Array:
 
 def _at(z: Array, since: Array) -> Array:
     """Range and bearing (M, 2) as seen ``since`` (M, 2) earlier, a way in m along the heading and a turn in rad."""
-    x, y = observation.at_range_bearing(z[:, 0], z[:, 1] + since[:, 1])
-    return np.column_stack(observation.range_bearing(x + since[:, 0], y))
+    x, y = models.at_range_bearing(z[:, 0], z[:, 1] + since[:, 1])
+    return np.column_stack(models.range_bearing(x + since[:, 0], y))

@@ -1,7 +1,8 @@
-"""Protocols of filters, run step by step or a whole trial at once."""
+"""What a filter is, run step by step or a whole trial at once, what it is told, and what it declares of itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Control, Estimates, Gaussian, Info, Observation, Trial
+from consistency.referee.errors import InputError
+from consistency.referee.geometry import ADDITIVE, PLANAR
 from consistency.referee.types import Array
 
 
@@ -80,3 +83,46 @@ class WholeTrial(Protocol):
     def run(self, trial: Trial, belief: Belief) -> Estimates: ...
     def is_ready(self, trial: Trial, belief: Belief) -> bool: ...
     def compile(self, trial: Trial, belief: Belief) -> None: ...
+
+
+def name_of(filter_: Filter) -> str:
+    """``name`` of a filter, or its class's."""
+    return str(getattr(filter_, "name", type(filter_).__name__))
+
+
+def error_of(filter_: Filter) -> str:
+    """Convention of the filter's own error, "so2" where it declares none.
+
+    Raises
+    ------
+    InputError
+        No such convention, or nothing that gives the covariance of that error.
+    """
+    error = getattr(filter_, "error", ADDITIVE)
+    if not isinstance(error, str) or error not in PLANAR:
+        raise InputError(f"filter '{name_of(filter_)}': its error must be one of {', '.join(PLANAR)}, got {error!r}")
+    if error != ADDITIVE and not isinstance(filter_, WholeTrial) and not hasattr(filter_, "own_covariance"):
+        raise InputError(f"filter '{name_of(filter_)}': with the error '{error}' it needs own_covariance(state)")
+    return error
+
+
+def own_errors(filters: Sequence[Filter]) -> dict[str, str]:
+    """Convention of each filter's own error, of those where it is not the additive one."""
+    errors = {name_of(f): error_of(f) for f in filters}
+    return {name: error for name, error in errors.items() if error != ADDITIVE}
+
+
+def optimal_gain(filter_: Filter) -> bool:
+    """Does the filter declare that its gain is optimal, so that its innovations may be judged?"""
+    declared = getattr(filter_, "innovations", None)
+    return isinstance(declared, str) and declared == "optimal"
+
+
+def rejects(filter_: Filter) -> bool:
+    """Does the filter say which observations it left out?"""
+    return callable(getattr(filter_, "rejected", None))
+
+
+def is_realisable(filter_: Any) -> bool:
+    """False for a filter that declares itself a bound, to be told the truth."""
+    return getattr(filter_, "realisable", True) is not False

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from consistency.bench.models.observation import project, triangulate_jacobian
 from consistency.bench.pages.sections.published_findings import extra_table
 from consistency.bench.pages.sections.report_input import Report
+from consistency.bench.scenario.models import project, triangulate_jacobian
 from consistency.bench.types import Gaussian
 from consistency.referee.show.blocks import Figure, Look, style
 from consistency.referee.show.figures import add_legend, canvas, path, points, stroke

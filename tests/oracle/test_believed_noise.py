@@ -13,7 +13,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters import MODULES, usable_names
-from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.filter_inputs import sensor_noise
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.scenario import BelievedSensor, BiasMap
 from consistency.bench.types import Gaussian

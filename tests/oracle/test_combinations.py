@@ -15,9 +15,8 @@ from estimates import apart
 
 import consistency as cs
 from consistency.bench.filters import usable_names
-from consistency.bench.filters.believed_noise import sensor_noise
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.filter_declarations import problem_for
+from consistency.bench.filters.filter_inputs import problem_for, sensor_noise
 from consistency.bench.filters.kernel.part_functions import (
     State,
     Unicycle,

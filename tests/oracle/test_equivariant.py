@@ -8,7 +8,7 @@ from consistency.bench.filters.kernel.part_functions import measure, measure_jac
 from consistency.bench.filters.methods import equivariant
 from consistency.bench.filters.methods.equivariant import sight, to_polar
 from consistency.bench.filters.parts.sensors import Uvd
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario.models import Mounting
 
 SENSOR = Uvd(150.0, 0.09, Mounting(0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1))
 Q, EPS = np.array([3.0, 0.7, -0.4]), np.array([0.2, -0.1, 0.15])  # m; rad, rad, logarithm

@@ -16,10 +16,8 @@ from consistency.bench.filters import EXTRAS, SMOOTHERS, filter_names, usable_na
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, heading_matrix
-from consistency.bench.models import motion
-from consistency.bench.models import observation as point
-from consistency.bench.models import observation as stereo
 from consistency.bench.protocols import Problem
+from consistency.bench.scenario import models
 from consistency.referee.types import Array
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed: pip install -e '.[smoothing]'")
@@ -74,7 +72,7 @@ class Dense:
     def poses(self, x):
         controls = np.array(self.trial.controls, complex)
         controls[:, 1:] += x[: 2 * self.trial.steps].reshape(-1, 2)
-        return motion.dead_reckoning(self.trial.start, controls)[1:]
+        return models.dead_reckoning(self.trial.start, controls)[1:]
 
     def landmarks(self, x):
         return x[2 * self.trial.steps :].reshape(-1, 3)
@@ -82,8 +80,8 @@ class Dense:
     def expected(self, x):
         pose, where = self.poses(x)[self.rows], self.landmarks(x)[np.searchsorted(self.labels, self.trial.landmark)]
         sensor = self.belief.sensor
-        c = point.to_sensor(*point.to_robot(*pose.T, *where.T), sensor.mount.packed())
-        return np.array(stereo.project(*c, sensor.f or 0.0, sensor.B or 0.0)).T
+        c = models.to_sensor(*models.to_robot(*pose.T, *where.T), sensor.mount.packed())
+        return np.array(models.project(*c, sensor.f or 0.0, sensor.B or 0.0)).T
 
     def residual(self, x):
         noise = x[: 2 * self.trial.steps].reshape(-1, 2) / self.sigma_motion

@@ -15,7 +15,7 @@ from consistency.bench.filters import guard as plain_guard
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiled_guard import guard_part, keep_agreeing
 from consistency.bench.filters.compiler.jit import Kernel
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import problem_of
 from consistency.bench.filters.guard import kept_observations, limits_of
 from consistency.bench.filters.kernel import loop
 from consistency.bench.filters.kernel.part_functions import make_guard_arrays

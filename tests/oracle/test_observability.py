@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import problem_for
+from consistency.bench.filters.filter_inputs import problem_for
 from consistency.bench.types import Observation
 
 WORLDS = {"xyz": "herath2007-xyz", "uvd": "herath2007-wide-baseline"}

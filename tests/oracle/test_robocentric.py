@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import truncnorm
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import problem_of
 from consistency.bench.filters.kernel.part_functions import Frame, State
 from consistency.bench.filters.methods import robocentric as rc
 from consistency.bench.filters.parts.converting import (

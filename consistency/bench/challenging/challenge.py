@@ -27,17 +27,15 @@ from scipy.stats import qmc
 from consistency.bench.challenging.world_space import Point, Space, require_right_belief, space_of
 from consistency.bench.filters import get_filter
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import name_of
 from consistency.bench.filters.run_filter import resolve_filters
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, name_of
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.montecarlo import run_trials
 from consistency.bench.runs.results_to_records import analyse
 from consistency.bench.runs.run_outcome import compile_all, first_trials, outcome_of
 from consistency.bench.runs.workers import worker_count
 from consistency.bench.scenario import Scenario, load_scenario, scenario_text
-from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.world import World
+from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM
 from consistency.referee.diagnostics.number_of_runs import gate_runs

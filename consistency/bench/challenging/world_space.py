@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.bench.scenario import Scenario, UniformLandmarks, UvdSensor, misbelief
 from consistency.bench.scenario.truth_and_belief import with_changes
-from consistency.bench.simulation.world import (
+from consistency.bench.simulation import (
     SHAPES,
     Changes,
     baseline_changes,
@@ -163,7 +163,11 @@ class Space:
             There is no such world: the scenario is refused.
         """
         values = {d.name: value for d, value in self._differences(point)}
-        return with_changes(self.base, name, self.text(point), _changes(self.base, values))
+        changes = _landmark_changes(self.base, values)
+        for dimension, changes_of in CHANGES.items():
+            if dimension in values:
+                changes |= changes_of(self.base, values[dimension])
+        return with_changes(self.base, name, self.text(point), changes)
 
     def text(self, point: Point) -> str:
         """What of a point differs from the base, in words."""
@@ -284,15 +288,6 @@ CHANGES: dict[str, Callable[[Scenario, Any], Changes]] = {
     "range": range_changes,
     "baseline": baseline_changes,
 }
-
-
-def _changes(base: Scenario, values: Mapping[str, Value]) -> Changes:
-    """Keys of the scenario that change, of values that are not those of the base."""
-    changes = _landmark_changes(base, values)
-    for name, changes_of in CHANGES.items():
-        if name in values:
-            changes |= changes_of(base, values[name])
-    return changes
 
 
 def _landmark_changes(base: Scenario, values: Mapping[str, Value]) -> Changes:

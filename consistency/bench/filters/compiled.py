@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from consistency.bench.filters.believed_noise import bias_at, sensor_noise
 from consistency.bench.filters.compiled_guard import guard_part
 from consistency.bench.filters.compiler.dispatch import fits, require_fitting
 from consistency.bench.filters.compiler.jit import Outlook
-from consistency.bench.filters.filter_declarations import is_realisable, problem_for
+from consistency.bench.filters.filter_inputs import bias_at, problem_for, sensor_noise
 from consistency.bench.filters.guard import Guarded
 from consistency.bench.filters.kernel.loop import Outcome, trial_kernel
 from consistency.bench.filters.kernel.part_functions import Data, Slam, landmark_width
 from consistency.bench.filters.kernel.update_steps import REASONS
 from consistency.bench.filters.parts.local import LOCAL_FROM, Local
 from consistency.bench.filters.parts.parking import Parking
-from consistency.bench.protocols import Filter, Problem
+from consistency.bench.protocols import Filter, Problem, is_realisable, name_of
 from consistency.bench.scenario import Belief, GuardSettings
 from consistency.bench.types import GUARDS, Estimates, Map, Trial
 from consistency.referee.errors import InputError
@@ -172,7 +171,7 @@ def guarded(filter_: Filter, kind: str) -> Any:
     >>> guarded(get_filter("ekf-uvd"), "gate").name  # doctest: +SKIP
     'ekf-uvd+gate'
     """
-    name = getattr(filter_, "name", type(filter_).__name__)
+    name = name_of(filter_)
     if kind not in GUARDS:
         raise InputError(f"filter '{name}': unknown guard '{kind}'; known: {', '.join(GUARDS)}")
     if isinstance(filter_, Guarded) or isinstance(getattr(filter_, "textbook", None), Guarded):

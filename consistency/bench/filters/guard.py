@@ -26,7 +26,7 @@ from typing import Any, cast
 import numpy as np
 from scipy import special
 
-from consistency.bench.protocols import Filter, Problem
+from consistency.bench.protocols import Filter, Problem, name_of
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.types import Control, Gaussian, Info, Observation
 from consistency.referee.types import Array, Indices
@@ -60,7 +60,7 @@ class Guarded:
 
     def __init__(self, filter_: Filter, kind: str) -> None:
         self.filter, self.kind = filter_, kind
-        self.name = f"{getattr(filter_, 'name', type(filter_).__name__)}+{kind}"
+        self.name = f"{name_of(filter_)}+{kind}"
         for name in DECLARED:
             if hasattr(filter_, name):
                 setattr(self, name, getattr(filter_, name))

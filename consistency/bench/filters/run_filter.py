@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.filters import filter_names, get_filter, usable_names
-from consistency.bench.filters.filter_declarations import error_of, name_of, problem_for, random_numbers, rejects
+from consistency.bench.filters.filter_inputs import problem_for, random_numbers
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.protocols import Filter, WholeTrial, error_of, name_of, rejects
 from consistency.bench.scenario import Belief
 from consistency.bench.scenario.toml_tables import UNITS
-from consistency.bench.types import Estimates, Gaussian, Info, Map, Trial
+from consistency.bench.types import Estimates, Info, Map, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import ADDITIVE
 from consistency.referee.parsing import one_line, require_name
@@ -241,7 +241,10 @@ def _map(filter_: Any, state: Any, trial: Trial) -> Map | None:
     labels = sorted(int(label) for label in landmarks)
     mean, covariance = np.empty((len(labels), 3)), np.empty((len(labels), 3, 3))
     for i, label in enumerate(labels):
-        mean[i], covariance[i] = _landmark(label, landmarks[label])
+        estimate = landmarks[label]
+        mean[i], covariance[i] = _array(estimate.mean, (3,), "map"), _array(estimate.covariance, (3, 3), "map")
+        _require_finite(f"landmark {label} in the map", mean[i], covariance[i])
+        _require_symmetric(f"the covariance of landmark {label} in the map", covariance[i])
     return Map(
         np.array(labels, np.int64), mean, covariance, _joint(filter_, state, [int(label) for label in landmarks])
     )
@@ -261,13 +264,6 @@ def _joint(filter_: Any, state: Any, labels: list[int]) -> Array | None:
     order = np.append(0, 1 + np.argsort(labels))
     rows = (3 * order[:, None] + np.arange(3)).ravel()
     return P[np.ix_(rows, rows)]
-
-
-def _landmark(label: int, estimate: Gaussian) -> tuple[Array, Array]:
-    mean, P = _array(estimate.mean, (3,), "map"), _array(estimate.covariance, (3, 3), "map")
-    _require_finite(f"landmark {label} in the map", mean, P)
-    _require_symmetric(f"the covariance of landmark {label} in the map", P)
-    return mean, P
 
 
 def _array(value: Any, shape: tuple[int, ...], method: str = "pose") -> Array:

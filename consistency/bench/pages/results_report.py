@@ -115,10 +115,10 @@ def compose(report: Report) -> Document:
     )  # fmt: skip
     shown = tuple(chapter for chapter in chapters if chapter.blocks)
     text, opening = answer(report.studies, report.findings), several_studies.opening(report)
-    return Document(report.title, text, shown, opening, badges=words_of(report))
+    return Document(report.title, text, shown, opening, badges=badges_of(report))
 
 
-def words_of(report: Report) -> tuple[Status, ...]:
+def badges_of(report: Report) -> tuple[Status, ...]:
     """The outcome of each finding, or of results without findings the verdict on each filter."""
     named = [(str(f["id"]), outcome(str(f["source"] or ""), str(f["verdict"]))) for f in report.findings]
     tracks = [(track.name, track.verdict.status) for study in report.studies for track in study.tracks]

@@ -150,14 +150,14 @@ def _rigs(regime: Regime) -> Table:
     shown = [axis for axis in regime.sweep.grid if alone or axis in _sides(regime)]
     facets = [axis for axis in regime.sweep.grid if axis not in shown]
     columns = (
-        *(Column(_short(axis.key).capitalize(), number=True) for axis in shown),
+        *(Column(axis.short.capitalize(), number=True) for axis in shown),
         *((Column("Otherwise"),) if alone else ()),
         Column("Filters to trust: RMSE, cost", width="1fr"), Column("Others", width="1fr"),
     )  # fmt: skip
     groups = []
     for at in itertools.product(*(range(len(axis.values)) for axis in facets)):
         fixed = list(zip(facets, at, strict=True))
-        title = ", ".join(f"{_short(axis.key)} {axis.say(i)}" for axis, i in fixed)
+        title = ", ".join(f"{axis.short} {axis.say(i)}" for axis, i in fixed)
         rows = tuple(
             (*values_of(regime.sweep, shown, cell), _trusted(regime, cell), _others(regime, cell))
             for cell in cells_of(regime, fixed)
@@ -199,10 +199,6 @@ def _provenance(regime: Regime) -> tuple[Block, ...]:
     return (Facts((*rows, *facts(dict(regime.manifest)))),)
 
 
-def _short(key: str) -> str:
-    return key.rpartition(".")[2]
-
-
 # --- along one axis ---------------------------------------------------------------------------------
 
 
@@ -233,10 +229,10 @@ def _along(regime: Regime, side: GridAxis) -> Figure:
         return add_legend(figure)
 
     caption = (
-        f"True over stated covariance, 1 is right (line), and RMSE of the position along {_short(side.key)}. The shape "
+        f"True over stated covariance, 1 is right (line), and RMSE of the position along {side.short}. The shape "
         "of a marker is the verdict."
     )
-    return Figure(f"Along {_short(side.key)}", caption, (draw,))
+    return Figure(f"Along {side.short}", caption, (draw,))
 
 
 def _marker(status: str, colour: str) -> Look:
@@ -251,7 +247,7 @@ def _draw_side(axes: Axes, side: str, axis: GridAxis) -> None:
     """Ticks and range of one axis of numbers."""
     first, last = float(axis.values[0]), float(axis.values[-1])
     unit = f" ({axis.unit})" if axis.unit else ""
-    axes.set(**{f"{side}label": _short(axis.key) + unit})
+    axes.set(**{f"{side}label": axis.short + unit})
     if axis.log:
         axes.set(**{f"{side}lim": (first / BEYOND, last * BEYOND)})
         log_axis(axes, side)
@@ -284,7 +280,7 @@ def cells_of(regime: Regime, fixed: Sequence[tuple[GridAxis, int]]) -> list[Grid
 def title_of(fixed: Sequence[tuple[GridAxis, int]]) -> str:
     """Values on the axes of a grid that a panel does not show."""
     shown = ((axis, i) for axis, i in fixed if axis.home is None and len(axis.values) > 1)
-    return ", ".join(f"{axis.key.rpartition('.')[2]} {axis.say(i)}" for axis, i in shown)
+    return ", ".join(f"{axis.short} {axis.say(i)}" for axis, i in shown)
 
 
 def heat_figure(regime: Regime, name: str) -> Figure:
@@ -325,12 +321,12 @@ def _draw_tiles(
     across, places = sides[0], [regime.sweep.axes.index(axis) for axis in sides]
     count = len(across.values)
     axes.grid(visible=False)
-    axes.set(title=wrapped(title_of(at), 46), xlabel=_short(across.key), xlim=(-0.5, count - 0.5), xticks=range(count))
+    axes.set(title=wrapped(title_of(at), 46), xlabel=across.short, xlim=(-0.5, count - 0.5), xticks=range(count))
     axes.set_xticklabels([wrapped(value_in_few_characters(across, i), 12) for i in range(count)])
     axes.set(ylim=(-0.5, 0.5), yticks=[])
     if len(sides) > 1:
         rows = len(sides[1].values)
-        axes.set(ylabel=_short(sides[1].key), ylim=(-0.5, rows - 0.5), yticks=range(rows))
+        axes.set(ylabel=sides[1].short, ylim=(-0.5, rows - 0.5), yticks=range(rows))
         axes.set_yticklabels([wrapped(value_in_few_characters(sides[1], i), 16) for i in range(rows)])
     cell_results = results_at(regime, name, at)
     if not cell_results:

@@ -28,9 +28,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from consistency.bench.filters.compiled import Compiled
-from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
 from consistency.bench.filters.run_filter import RunRecord, reason_of, run_filter
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, error_of, name_of, rejects
 from consistency.bench.runs.process_start import begin, nothing
 from consistency.bench.scenario import Belief
 from consistency.bench.types import Estimates, Trial

@@ -15,9 +15,8 @@ from typing import Any
 
 import pandas as pd
 
-from consistency.bench.filters.filter_declarations import name_of, own_errors
 from consistency.bench.filters.run_filter import resolve_filters
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, name_of, own_errors
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.outcomes_to_results import PLAN, StudyRounds, gathered_in
 from consistency.bench.runs.results_to_records import record_of

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from consistency.bench.filters.filter_declarations import name_of, optimal_gain
+from consistency.bench.protocols import name_of, optimal_gain
 from consistency.bench.runs.run_outcome import RunOutcome, TrialWork, Workers
 from consistency.bench.store.journal import IN_MEMORY, Journal, Unfinished
 from consistency.bench.store.parquet import (
@@ -254,7 +254,7 @@ class Gathered:
         with Writer(new.path / f"{table}.parquet", table, columns) as writer:
             for name in names:
                 for piece in self.pieces(table, name):
-                    writer.add(piece, filter=name)
+                    writer.add(piece, name)
                 writer.end_group()
 
     def _before(self, table: str, filter_name: str) -> Iterator[tuple[int, Columns]]:

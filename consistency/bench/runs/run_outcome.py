@@ -24,13 +24,11 @@ from joblib.externals.loky.backend.reduction import dumps
 from consistency.bench.filters.compiled import Compiled, one_blas_thread
 from consistency.bench.filters.compiler import jit
 from consistency.bench.filters.compiler.jit import Outlook
-from consistency.bench.filters.filter_declarations import name_of
 from consistency.bench.filters.kernel.linalg import definiteness
-from consistency.bench.protocols import Filter, WholeTrial
+from consistency.bench.protocols import Filter, WholeTrial, name_of
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.scenario import Belief, Scenario
-from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.world import World
+from consistency.bench.simulation import World, require_landmarks_in_view
 from consistency.bench.store.parquet import Columns, Rejected, truth_columns
 from consistency.bench.store.results import JOINT
 from consistency.bench.types import Estimates, Map, Trial

@@ -27,8 +27,8 @@ import joblib
 from joblib.externals.loky.backend.reduction import dumps
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import error_of, name_of, rejects
 from consistency.bench.filters.run_filter import RunRecord, reason_of
+from consistency.bench.protocols import error_of, name_of, rejects
 from consistency.bench.runs.run_outcome import Outcomes, Recorded, RunOutcome, TrialWork, outcome_of
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
@@ -45,7 +45,7 @@ AT_A_TIME = 1000  # batches of an executor that does not say how many it should 
 SECONDS = 1.5  # after which a batch comes back with what is done of it, where the executor does not say
 DECIDING = ("numpy", "scipy", "numba")  # packages whose versions the bits depend on
 # and our own sources
-ROOMS = ("referee/geometry.py", "bench/models", "bench/scenario", "bench/simulation", "bench/filters")
+ROOMS = ("referee/geometry.py", "bench/scenario", "bench/simulation.py", "bench/filters")
 
 
 def worker_count(jobs: int) -> int:

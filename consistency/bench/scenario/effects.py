@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from consistency.bench.models import observation
+from consistency.bench.scenario import models
 from consistency.bench.scenario.observations import (
     EFFECTS,
     NO_LANDMARK,
@@ -25,6 +25,7 @@ from consistency.bench.scenario.observations import (
     Observations,
     UvdEffect,
     register_effect,
+    require_search_range,
 )
 from consistency.bench.scenario.toml_tables import Count, Finite, NonNegative, Positive, Rate
 from consistency.referee.types import Array, Indices
@@ -68,8 +69,8 @@ class FieldOfView:
         rows = max(BLOCK // len(context.landmarks), 1)
         for k in range(0, len(seen), rows):
             here = slice(k, k + rows)
-            body = observation.turned_to_robot(x[here], y[here], c[here], s[here], *context.landmarks.T)
-            seen[here] = _visible(context, *observation.to_sensor(*body, mount))
+            body = models.turned_to_robot(x[here], y[here], c[here], s[here], *context.landmarks.T)
+            seen[here] = _visible(context, *models.to_sensor(*body, mount))
         return observations.keep(seen)
 
 
@@ -106,7 +107,7 @@ def _visible(context: Context, x: Array, y: Array, z: Array) -> Array:
         return seen
     assert sensor.f is not None
     with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, _ = observation.project(x, y, z, sensor.f, 0.0)
+        u, v, _ = models.project(x, y, z, sensor.f, 0.0)
     return np.asarray(seen & (x > 0) & context.in_image(u, v))
 
 
@@ -167,8 +168,8 @@ class Mismatch(UvdEffect):
 
     @model_validator(mode="after")
     def _is_a_range(self) -> Mismatch:
-        if self.disparity is not None and self.disparity[0] >= self.disparity[1]:
-            raise ValueError("disparity must be [low, high] with low < high")
+        if self.disparity is not None:
+            require_search_range(self.disparity)
         return self
 
     def apply(self, observations: Observations, rng: np.random.Generator, context: Context) -> Observations:
@@ -284,10 +285,8 @@ class Junction(UvdEffect):
         ray = np.array([np.full(J, sensor.f), -u, -v])
         ray *= rng.uniform(*sensor.range, J) / np.linalg.norm(ray, axis=0)
         mount = sensor.mount.packed()
-        near = np.stack(
-            observation.to_world(x, y, heading, *observation.from_sensor(ray[0], ray[1], ray[2], mount)), axis=1
-        )
-        camera = np.broadcast_arrays(*observation.to_world(x, y, heading, *mount[:3]))
+        near = np.stack(models.to_world(x, y, heading, *models.from_sensor(ray[0], ray[1], ray[2], mount)), axis=1)
+        camera = np.broadcast_arrays(*models.to_world(x, y, heading, *mount[:3]))
         sight = near - np.stack(camera, axis=1)
         across = np.hypot(sight[:, 0], sight[:, 1])
         far = near + (rng.uniform(*self.behind, J) / across)[:, None] * sight
@@ -298,7 +297,7 @@ class Junction(UvdEffect):
         """(u, v, d) (T, J, 3) of the crossings in steps 1..T, and where they are observed (T, J)."""
         sensor, mount = context.sensor, context.sensor.mount.packed()
         x, y, heading = context.path[1:].T[..., None]
-        cx, cy, cz = observation.to_world(x, y, heading, *mount[:3])
+        cx, cy, cz = models.to_world(x, y, heading, *mount[:3])
         # camera + ratio (near - camera) = far + s along, seen from above; ratio > 1 where the far edge is behind
         a0, a1 = edges.near[:, 0] - cx, edges.near[:, 1] - cy
         w0, w1 = edges.far[:, 0] - cx, edges.far[:, 1] - cy
@@ -307,10 +306,10 @@ class Junction(UvdEffect):
             ratio = (w0 * e1 - w1 * e0) / (a0 * e1 - a1 * e0)
             s = (w0 * a1 - w1 * a0) / (a0 * e1 - a1 * e0)
             height = cz + (edges.far[:, 2] - cz) / ratio
-            body = observation.to_robot(x, y, heading, *np.broadcast_arrays(edges.near[:, 0], edges.near[:, 1], height))
-            at = observation.to_sensor(*body, mount)
+            body = models.to_robot(x, y, heading, *np.broadcast_arrays(edges.near[:, 0], edges.near[:, 1], height))
+            at = models.to_sensor(*body, mount)
             assert sensor.rig is not None
-            u, v, d = observation.project(*at, *sensor.rig)
+            u, v, d = models.project(*at, *sensor.rig)
             distance, half = np.sqrt(at[0] ** 2 + at[1] ** 2 + at[2] ** 2), 0.5 * self.edge
             seen = (ratio > 1.0) & (np.abs(s) <= half) & (np.abs(height - edges.near[:, 2]) <= half)
             seen &= (at[0] > 0.0) & (distance >= sensor.range[0]) & (distance <= sensor.range[1])

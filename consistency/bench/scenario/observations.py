@@ -24,8 +24,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from consistency.bench.models import observation
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario import models
 from consistency.bench.scenario.toml_tables import Count, Finite, Interval, Positive, Sigmas, Table, Triple
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array, Indices
@@ -183,9 +182,9 @@ class Context:
         """
         points = self._linearised(step, landmark) if self.linear else self.points(step, landmark)
         if self.sensor.rig is not None:
-            points = observation.project(*points, *self.sensor.rig)
+            points = models.project(*points, *self.sensor.rig)
         if self.sensor.model == "range-bearing":
-            return np.stack(observation.range_bearing(*points[:2]), axis=-1)
+            return np.stack(models.range_bearing(*points[:2]), axis=-1)
         return np.stack(points[: self.sensor.size], axis=-1)
 
     def in_image(self, u: Array, v: Array) -> Array:
@@ -197,16 +196,16 @@ class Context:
 
     def points(self, step: Indices, landmark: Indices) -> tuple[Array, Array, Array]:
         """True x, y, z of landmarks in the sensor frame in steps 1..T, m, each (M,)."""
-        body = observation.to_robot(*self.path[step].T, *self.landmarks[landmark].T)
-        return observation.to_sensor(*body, self.sensor.mount.packed())
+        body = models.to_robot(*self.path[step].T, *self.landmarks[landmark].T)
+        return models.to_sensor(*body, self.sensor.mount.packed())
 
     def _linearised(self, step: Indices, landmark: Indices) -> tuple[Array, Array, Array]:
         pose, reference = self.path[step], self.planned[step]
-        x, y, z = observation.to_robot(*reference.T, *self.landmarks[landmark].T)
+        x, y, z = models.to_robot(*reference.T, *self.landmarks[landmark].T)
         c, s = np.cos(reference[:, 2]), np.sin(reference[:, 2])
         dx, dy, dh = (pose - reference).T
         body = x - c * dx - s * dy + y * dh, y + s * dx - c * dy - x * dh, z
-        return observation.to_sensor(*body, self.sensor.mount.packed())
+        return models.to_sensor(*body, self.sensor.mount.packed())
 
 
 class ListedEffect(Table):
@@ -267,6 +266,12 @@ def register_effect(effect: type[E]) -> type[E]:
     """Decorator that makes the kind of an effect known to scenarios."""
     EFFECTS[effect.model_fields["kind"].default] = effect
     return effect
+
+
+def require_search_range(disparity: tuple[float, float]) -> None:
+    """Refuse a range of disparities whose ends are not in order."""
+    if disparity[0] >= disparity[1]:
+        raise ValueError("disparity must be [low, high] with low < high")
 
 
 def require_increasing(key: str, nodes: tuple[float, ...]) -> None:
@@ -398,9 +403,9 @@ class Mount(Table):
     position: Triple = (0.0, 0.0, 0.0)
     rotation: Triple = (0.0, 0.0, 0.0)  # roll, pitch, heading
 
-    def packed(self) -> Mounting:
+    def packed(self) -> models.Mounting:
         """Position and rotation matrix, as the models take it."""
-        return Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
+        return models.Mounting(*self.position, *(float(entry) for entry in rotation(*self.rotation).ravel()))
 
 
 class Sensor(Table):

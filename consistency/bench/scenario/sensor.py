@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializeAsAny, field_validator, model_validator
 
 from consistency.bench.scenario.effects import BUILT_IN, BiasMap, DisparityGrowth, ListedEffect
-from consistency.bench.scenario.observations import ImageSensor, SeeingSensor, Sensor
+from consistency.bench.scenario.observations import ImageSensor, SeeingSensor, Sensor, require_search_range
 from consistency.bench.scenario.toml_tables import Positive
 
 
@@ -40,7 +40,7 @@ class BelievedSensor(StereoSensor):
         if self.model == "uvd" and (self.f is None or self.B is None):
             raise ValueError("a uvd sensor needs f (px) and B (m)")
         if self.disparity is not None:
-            _require_search_range(self.disparity)
+            require_search_range(self.disparity)
         if self.bias is not None and self.model != "uvd":
             raise ValueError(f"bias is of a sensor 'uvd', not '{self.model}'; leave it out")
         return self
@@ -51,11 +51,6 @@ class BelievedSensor(StereoSensor):
         assert self.f is not None
         assert self.B is not None
         return self.f, self.B
-
-
-def _require_search_range(disparity: tuple[float, float]) -> None:
-    if disparity[0] >= disparity[1]:
-        raise ValueError("disparity must be [low, high] with low < high")
 
 
 class PicturedSensor(BelievedSensor, ImageSensor):
@@ -128,7 +123,7 @@ class UvdSensor(TrueSensor, StereoSensor):
 
     @model_validator(mode="after")
     def _search_range(self) -> UvdSensor:
-        _require_search_range(self.disparity)
+        require_search_range(self.disparity)
         return self
 
 

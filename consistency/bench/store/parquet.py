@@ -71,16 +71,13 @@ class Writer:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def add(self, columns: Columns, **constant: str) -> None:
-        """Rows of arrays; ``constant`` is the text of a column that is the same in all of them.
-
-        An optional column that is not among them is null.
-        """
+    def add(self, columns: Columns, filter_name: str | None = None) -> None:
+        """Rows of arrays, all of the filter that is named; an optional column that is not among them is null."""
         rows = len(next(iter(columns.values())))
         arrays = []
         for field in self.schema:
-            if field.name in constant:
-                array = pa.repeat(pa.scalar(constant[field.name], field.type), rows)
+            if field.name == "filter" and filter_name is not None:
+                array = pa.repeat(pa.scalar(filter_name, field.type), rows)
             elif field.name in self.optional and field.name not in columns:
                 array = pa.nulls(rows, field.type)
             else:
@@ -119,7 +116,7 @@ def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
         else:
             for filter_name in table["filter"].unique():
                 part = table[table["filter"] == filter_name].drop(columns="filter")
-                writer.add({str(column): part[column].to_numpy() for column in part}, filter=filter_name)
+                writer.add({str(column): part[column].to_numpy() for column in part}, filter_name)
                 writer.end_group()
         writer.end_group()
 
@@ -300,12 +297,9 @@ def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
 
 def _content_of(folder: Path, name: str) -> dict[str, Any]:
 
-    return {"rows": require_table(folder, name).metadata.num_rows, "sha256": _digest(folder / f"{name}.parquet")}
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    with (folder / f"{name}.parquet").open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"rows": require_table(folder, name).metadata.num_rows, "sha256": digest}
 
 
 def require_unchanged(folder: Path, manifest: dict[str, Any]) -> None:

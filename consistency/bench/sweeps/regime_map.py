@@ -190,7 +190,7 @@ def _cells_table(regime: Regime) -> Table:
     """A row for each cell: its values, and the verdict and covariance ratio of each filter."""
     sweep = regime.sweep
     axes = [axis for axis in sweep.grid if len(axis.values) > 1] or list(sweep.grid)
-    columns = [Column(axis.key.rpartition(".")[2], number=axis.numeric, most=WIDEST) for axis in axes]
+    columns = [Column(axis.short, number=axis.numeric, most=WIDEST) for axis in axes]
     if sweep.alone:
         columns.append(Column("otherwise", most=WIDEST))
     columns += map(Column, sweep.filters)

@@ -8,7 +8,7 @@ import json
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -51,8 +51,8 @@ KIND, CELL_KIND = "sweep", "cell"
 CELLS = "cells"  # folder of the cells in that of the sweep
 # rooms whose code the numbers of a cell depend on
 CODE = (
-    "referee/diagnostics", "referee/geometry.py", "referee/verdicts", "bench/filters", "bench/models",
-    "bench/runs/run_outcome.py", "bench/runs/montecarlo.py", "bench/scenario", "bench/simulation", "bench/store",
+    "referee/diagnostics", "referee/geometry.py", "referee/verdicts", "bench/filters",
+    "bench/runs/run_outcome.py", "bench/runs/montecarlo.py", "bench/scenario", "bench/simulation.py", "bench/store",
 )  # fmt: skip
 TIMED = 3  # times that a trial is timed, of which the least counts, and trials that are tried
 SLOW = 1.0  # s, a trial that takes longer is timed once
@@ -60,7 +60,9 @@ PATIENCE = 60.0  # s, a trial of a filter that is not compiled is not timed if i
 RUN_COLUMNS = ("run", "nees", "rmse_position", "rmse_heading", "failed_at", "reason")
 
 
-def run_sweep(sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, **how: Any) -> SweepFolder:
+def run_sweep(
+    sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, executor: Executor | None = None
+) -> SweepFolder:
     """Do what is not done yet, each filter in each cell by itself.
 
     Finished runs of a cell are kept in a journal until the cell is done, so that the same call continues within it.
@@ -70,7 +72,7 @@ def run_sweep(sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, 
     ----------
     out : folder, which may hold a part of the same sweep
     overwrite : run cells again that were made with other inputs
-    jobs, how : who does the runs, as for :func:`consistency.bench.runs.montecarlo.run_until_decided`
+    jobs, executor : as for :func:`consistency.bench.runs.montecarlo.run_trials`
 
     Raises
     ------
@@ -91,13 +93,13 @@ def run_sweep(sweep: Sweep, out: Path, overwrite: bool = False, jobs: int = -1, 
     if len(todo) < len(work):
         say(f"{len(work) - len(todo)} of {len(work)} are there already")
     started = time.monotonic()
-    for count, done in enumerate(_in_turn(folder, todo, {"jobs": jobs, **how}), 1):
+    for count, done in enumerate(_in_turn(folder, todo, jobs, executor), 1):
         seconds_left = (time.monotonic() - started) / count * (len(todo) - count)
         say(f"{count} of {len(todo)}: {done.text}: {_outcome_text(folder.result(done))}{_time_left(seconds_left)}")
     return folder
 
 
-def _in_turn(folder: SweepFolder, todo: list[CellWork], how: dict[str, Any]) -> Iterator[CellWork]:
+def _in_turn(folder: SweepFolder, todo: list[CellWork], jobs: int, executor: Executor | None) -> Iterator[CellWork]:
     """Do each, and yield it when it is there; what another process is at work on is tried again after the others."""
     is_told = False
     while todo:
@@ -107,7 +109,7 @@ def _in_turn(folder: SweepFolder, todo: list[CellWork], how: dict[str, Any]) -> 
                 with _system_refusals(folder), folder.at_work(work) as journal:
                     if folder.result(work) is None:  # nobody has done it meanwhile
                         begun = time.monotonic()
-                        outcome = run_cell(folder.sweep, work.cell, work.filter, journal=journal, **how)
+                        outcome = run_cell(folder.sweep, work.cell, work.filter, journal, jobs, executor)
                         folder.write(work, outcome, time.monotonic() - begun)
             except Busy:
                 busy_cells.append(work)
@@ -374,7 +376,14 @@ class CellOutcome(NamedTuple):
     runs: pd.DataFrame  # RUN_COLUMNS
 
 
-def run_cell(sweep: Sweep, cell: Cell, filter_name: str, **how: Any) -> CellOutcome:
+def run_cell(
+    sweep: Sweep,
+    cell: Cell,
+    filter_name: str,
+    journal: Journal | None = None,
+    jobs: int = -1,
+    executor: Executor | None = None,
+) -> CellOutcome:
     """Run one filter in one cell until it is decided.
 
     The trials depend on the sweep's seed and the cell's scenario alone. An exception is a result, too: the filter has
@@ -382,7 +391,7 @@ def run_cell(sweep: Sweep, cell: Cell, filter_name: str, **how: Any) -> CellOutc
 
     Parameters
     ----------
-    how : who does the runs and what keeps them, as for :func:`run_until_decided`
+    journal, jobs, executor : as for :func:`run_until_decided`
 
     Raises
     ------
@@ -392,7 +401,9 @@ def run_cell(sweep: Sweep, cell: Cell, filter_name: str, **how: Any) -> CellOutc
     rule, seed = sweep.rule.model_dump(), sweep.seed_of(cell)
     try:
         with quiet():
-            results, verdicts = run_until_decided(cell.scenario, [filter_name], **rule, seed=seed, **how)
+            results, verdicts = run_until_decided(
+                cell.scenario, [filter_name], **rule, seed=seed, jobs=jobs, executor=executor, journal=journal
+            )
         verdict, record = verdicts[filter_name], record_of(results, filter_name)
     except Exception as error:  # what breaks one cell must not end a night of others
         if isinstance(error, OSError) or isinstance(error.__cause__, OSError):  # it would break all of them

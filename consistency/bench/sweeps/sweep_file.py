@@ -32,7 +32,7 @@ from consistency.bench.scenario import (
     read_table,
 )
 from consistency.bench.scenario.truth_and_belief import unknown, with_changes
-from consistency.bench.simulation.world import (
+from consistency.bench.simulation import (
     Changes,
     baseline_changes,
     course_of,
@@ -115,14 +115,15 @@ class Sweep:
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
         """Every cell, in the order of :func:`grid_points`; raises ValueError where a scenario is refused."""
-        return tuple(self._cell(number, at) for number, at in enumerate(grid_points(self.axes)))
-
-    def _cell(self, number: int, at: tuple[int, ...]) -> Cell:
-        changes: dict[str, Any] = {}
-        for axis, i in _changed(self.axes, at):
-            changes |= axis.changes(self.base, axis.values[i])
-        name, text = _folder_name(self.axes, at), text_of(self.axes, at)
-        return Cell(number, at, name, text, with_changes(self.base, name, f"{self.base.name}, {text}", changes))
+        cells = []
+        for number, at in enumerate(grid_points(self.axes)):
+            changes: dict[str, Any] = {}
+            for axis, i in _changed(self.axes, at):
+                changes |= axis.changes(self.base, axis.values[i])
+            name, text = _folder_name(self.axes, at), text_of(self.axes, at)
+            scenario = with_changes(self.base, name, f"{self.base.name}, {text}", changes)
+            cells.append(Cell(number, at, name, text, scenario))
+        return tuple(cells)
 
     @property
     def reference(self) -> str:
@@ -398,9 +399,9 @@ class Axis:
         return QUANTITIES[self.key].unit if self.key in QUANTITIES else ""
 
     @property
-    def label(self) -> str:
-        """For the axis of a figure or the head of a column."""
-        return f"{self.text} ({self.unit})" if self.unit else self.text
+    def short(self) -> str:
+        """Last part of the key."""
+        return self.key.rpartition(".")[2]
 
     @property
     def numeric(self) -> bool:

@@ -24,8 +24,7 @@ from scipy import stats
 from scipy.optimize import NonlinearConstraint, minimize
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.filters.filter_declarations import name_of, rejects
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, name_of, rejects
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.run_outcome import compile_all, outcome_of
 from consistency.bench.runs.workers import worker_count

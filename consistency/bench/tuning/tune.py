@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from consistency.bench.filters import get_filter
-from consistency.bench.filters.filter_declarations import name_of
 from consistency.bench.filters.run_filter import resolve_filters
-from consistency.bench.protocols import Filter
+from consistency.bench.protocols import Filter, name_of
 from consistency.bench.runs.montecarlo import require_counts, run_log, run_trials
 from consistency.bench.runs.results_to_records import analyse
 from consistency.bench.runs.run_outcome import Simulated

@@ -11,8 +11,7 @@ import numpy as np
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario import PicturedSensor, models
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array
 from consistency.stereo.characterising.characterise import Characterisation, Residuals, characterise, robust_sd
@@ -290,13 +289,13 @@ def _project(pose: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """Ideal (u, v, d) (c, 3) of a board; the pose is a rotation vector and a place in m, sensor axes."""
     points = Rotation.from_rotvec(pose[:3]).apply(board) + pose[3:]
     x, y, w = points.T
-    return np.stack(observation.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
+    return np.stack(models.project(x, y, w, calibrated.f, calibrated.B), axis=-1)
 
 
 def _first_pose(z: Array, board: Array, calibrated: BoardCalibration) -> Array:
     """The pose that lays the board best on the triangulated corners, Arun et al. (1987)."""
     u, v, d = z.T
-    seen = np.stack(observation.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
+    seen = np.stack(models.triangulate(u, v, d, calibrated.f, calibrated.B), axis=-1)
     middle = seen.mean(axis=0)
     middle_of_board = board.mean(axis=0)
     turn, _ = Rotation.align_vectors(seen - middle, board - middle_of_board)

@@ -13,8 +13,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from consistency.bench.filters.compiled import one_blas_thread
-from consistency.bench.models import observation
-from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario import PicturedSensor, models
 from consistency.bench.scenario.observations import bilinear, hats
 from consistency.bench.types import Trial
 from consistency.referee.diagnostics.verdict_parts import Interval
@@ -384,9 +383,9 @@ def residuals_of(trials: Sequence[Trial], sensor: PicturedSensor) -> tuple[Resid
         strange += len(trial.z) - len(rows)
         step = trial.step[rows]
         landmark = trial.landmark[rows]
-        body = observation.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
-        in_sensor = observation.to_sensor(*body, sensor.mount.packed())
-        ideal = np.stack(observation.project(*in_sensor, *sensor.rig), axis=-1)
+        body = models.to_robot(*trial.truth[step].T, *trial.landmarks[landmark].T)
+        in_sensor = models.to_sensor(*body, sensor.mount.packed())
+        ideal = np.stack(models.project(*in_sensor, *sensor.rig), axis=-1)
         track = landmark + number * trial.n_landmarks
         parts.append((trial.z[rows] - ideal, ideal, track, step, moved_before(trial.truth)[step]))
     return Residuals(*map(np.concatenate, zip(*parts, strict=True))), strange

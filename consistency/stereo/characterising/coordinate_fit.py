@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -200,10 +201,7 @@ def tails(w: Array, level: float) -> ResidualTails:
     w = (w - w.mean()) / w.std(ddof=1)
 
     def deviance(weight: float) -> float:
-        def negative(log_scale: float) -> float:
-            return _negative(w, weight, log_scale)
-
-        return 2.0 * optimize.minimize_scalar(negative, bounds=(-1.5, 0.5), method="bounded").fun
+        return 2.0 * optimize.minimize_scalar(partial(_negative, w, weight), bounds=(-1.5, 0.5), method="bounded").fun
 
     best = optimize.minimize_scalar(deviance, bounds=(0.0, HEAVIEST), method="bounded", options={"xatol": 1e-5})
     value = float(best.x)

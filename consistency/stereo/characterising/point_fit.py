@@ -18,8 +18,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.scenario import PicturedSensor
+from consistency.bench.scenario import PicturedSensor, models
 from consistency.bench.scenario.observations import hats
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
@@ -380,7 +379,7 @@ def _first_points(seen: Sightings, f: float, B: float) -> Array:
     _, first = np.unique(seen.track, return_index=True)
     best = np.lexsort((-seen.z[:, 2], seen.track))[first]
     u, v, d = seen.z[best].T
-    local = np.stack(observation.triangulate(u, v, d, f, B), axis=-1)
+    local = np.stack(models.triangulate(u, v, d, f, B), axis=-1)
     return np.einsum("nij,nj->ni", seen.R[best], local) + seen.t[best]
 
 
@@ -419,8 +418,8 @@ def slopes_of(
     in_sensor = np.einsum("tnji,tnj->tni", R, points[:, None] - t)
     in_sensor[..., 0] = np.maximum(in_sensor[..., 0], NEAREST)
     x, y, w = np.moveaxis(in_sensor, -1, 0)
-    predicted = np.stack(observation.project(x, y, w, f, B), axis=-1)
-    entries = np.stack(observation.project_jacobian(x, y, w, f, B), axis=-1)
+    predicted = np.stack(models.project(x, y, w, f, B), axis=-1)
+    entries = np.stack(models.project_jacobian(x, y, w, f, B), axis=-1)
     J = entries.reshape(*x.shape, 3, 3) / sigma[..., None]
     by_point = J @ np.swapaxes(R, -1, -2)
     by_pose = np.concatenate([-J, J @ cross_matrix(in_sensor)], axis=-1)

@@ -235,10 +235,10 @@ def as_json(of: Characterisation) -> str:
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:
     return {
-        "sigma": _as_dictionary(c.sigma),
-        "correlation": _as_dictionary(c.correlation),
-        "offset": _as_dictionary(c.offset),
-        "tail_weight": _as_dictionary(c.tails.weight),
+        "sigma": c.sigma._asdict(),
+        "correlation": c.correlation and c.correlation._asdict(),
+        "offset": c.offset and c.offset._asdict(),
+        "tail_weight": c.tails.weight._asdict(),
         "skewness": c.tails.skewness,
         "excess_kurtosis": c.tails.excess_kurtosis,
         "normality_p": c.tails.p_value,
@@ -247,12 +247,6 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
         "about_tracks": c.about_tracks,
         "autocorrelation": c.lags,
     }
-
-
-def _as_dictionary(estimate: Interval | None) -> dict[str, float] | None:
-    if estimate is None:
-        return None
-    return estimate._asdict()
 
 
 def require_free_file(path: Path, overwrite: bool) -> None:

@@ -18,9 +18,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount, models
 from consistency.bench.store.parquet import write_tables
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
@@ -475,14 +473,14 @@ def misfit(
     packed = mount.packed()
     nearest = seen.loc[seen.groupby("landmark")["z2"].idxmax()].set_index("landmark")
     u, v, d = nearest[PIXELS].to_numpy(float).T
-    in_sensor = observation.triangulate(u, v, d, rig.f, rig.baseline)
-    in_robot = observation.from_sensor(*in_sensor, packed)
+    in_sensor = models.triangulate(u, v, d, rig.f, rig.baseline)
+    in_robot = models.from_sensor(*in_sensor, packed)
     x, y, heading = path[nearest["step"]].T
-    places = np.column_stack(observation.to_world(x, y, heading, *in_robot))
+    places = np.column_stack(models.to_world(x, y, heading, *in_robot))
     others = seen[seen["step"].to_numpy() != nearest["step"].loc[seen["landmark"]].to_numpy()]
     targets = places[nearest.index.get_indexer(others["landmark"])]
-    in_robot = observation.to_robot(*path[others["step"]].T, *targets.T)
-    expected = observation.project(*observation.to_sensor(*in_robot, packed), rig.f, rig.baseline)
+    in_robot = models.to_robot(*path[others["step"]].T, *targets.T)
+    expected = models.project(*models.to_sensor(*in_robot, packed), rig.f, rig.baseline)
     error = others[PIXELS].to_numpy(float) - np.column_stack(expected)
     u, v, d = np.sqrt(np.mean(error**2, axis=0)).tolist()
     return u, v, d
@@ -561,7 +559,7 @@ def planar_path(motions: Array) -> Array:
     """Poses x, y, heading (T + 1, 3) from :func:`planar_motions`, from the origin on; the heading is not wrapped."""
     forward, left, turn = motions.T
     controls = np.column_stack([np.ones(len(motions)), forward, turn])
-    path = dead_reckoning(np.zeros(3), controls)
+    path = models.dead_reckoning(np.zeros(3), controls)
     heading = path[:-1, 2]
     path[1:, 0] -= np.cumsum(left * np.sin(heading))
     path[1:, 1] += np.cumsum(left * np.cos(heading))

@@ -79,7 +79,7 @@ NAMES = ("bias_u_px", "bias_v_px", "bias_d_px")
 FINEST, OCTAVES, CONTRAST = 0.1, 4, 12.0  # m, number, grey values: a wall without fine detail
 
 
-def stage(role: str, name: str, **settings: Any) -> Any:
+def stage(role: str, name: str, settings: Mapping[str, Any]) -> Any:
     """A stage by its role and name.
 
     Raises
@@ -176,10 +176,10 @@ class Chain:
         """A chain of named stages (:data:`STAGES`), with ``settings`` by role, or by name for filters."""
         given = settings or {}
         return cls(
-            stage("selection", selection, **given.get("selection", {})),
-            stage("tracking", tracking, **given.get("tracking", {})),
-            stage("correspondence", correspondence, **given.get("correspondence", {})),
-            tuple(stage("filter", name, **given.get(name, {})) for name in filters),
+            stage("selection", selection, given.get("selection", {})),
+            stage("tracking", tracking, given.get("tracking", {})),
+            stage("correspondence", correspondence, given.get("correspondence", {})),
+            tuple(stage("filter", name, given.get(name, {})) for name in filters),
         )
 
     def run(

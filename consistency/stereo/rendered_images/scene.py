@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.special import ndtr
 
-from consistency.bench.models import observation
+from consistency.bench.scenario import models
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import rotation
 from consistency.referee.types import Array, Indices
@@ -420,7 +420,7 @@ class StereoCamera:
     def ideal(self, points: Array) -> Array:
         """(u, v, d) in px of points (N, 3) in the robot frame, m, with ideal cameras: Herath et al. (2007) eq. 22."""
         x, y, z = points.T
-        return np.stack(observation.project(x, y, z, self.f, self.B), axis=-1)
+        return np.stack(models.project(x, y, z, self.f, self.B), axis=-1)
 
     def real(self, points: Array) -> Array:
         """(u, v, d) in px of points (N, 3) with the cameras as they are: what a chain without noise would measure."""

@@ -18,6 +18,7 @@ theorem: d y / d x = -C_yy^-1 C_yx (eq. 2.23).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -45,6 +46,7 @@ SLACK = 1e-12  # relative rounding of the cost
 AT_MINIMUM = 1e-3  # standard deviations that a pose may be away from the minimum that the theorem speaks of
 
 
+@cache
 def threshold(dof: int) -> float:
     """Standardised residual c, of ``dof`` dimensions, that a point without fault exceeds with probability 0.05."""
     return np.sqrt(stats.chi2.isf(TAIL, dof))
@@ -129,8 +131,8 @@ def register_weighted(
     p1, p2 = checked_clouds(p1, p2)
     S1 = arrays.covariances("S1", S1, len(p1), 3)
     S2 = arrays.covariances("S2", S2, len(p1), 3)
-    frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2))
-    return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2, robust)
+    frames = TwoFrames(PointMatches(), p1, p2, _weights("S1", S1), _weights("S2", S2), robust)
+    return _refined(frames, S1, S2, pose or register_svd(p1, p2), p2)
 
 
 def refine_reprojection(
@@ -172,8 +174,8 @@ def refine_reprojection(
         S2 = arrays.covariances("S_uv2", S_uv2, len(uv1), 4)
     _, q = checked_clouds(triangulate(rig, uv1), triangulate(rig, uv2))
     rig.project(pose.apply(q))
-    frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2))
-    return _refined(frames, S1, S2, pose, q, robust)
+    frames = TwoFrames(PixelMatches(rig), uv1, uv2, _weights("S_uv", S1), _weights("S_uv2", S2), robust)
+    return _refined(frames, S1, S2, pose, q)
 
 
 def _weights(name: str, S: Array) -> Array:
@@ -194,16 +196,13 @@ def _refined(
     S2: Array,
     pose: RelativePose,
     q: Array,
-    robust: Robust | None,
 ) -> Refined:
-    free = 2 * frames.z1.shape[1] - 3  # of a point's residual, its position eliminated
-    c = threshold(free)
-    pose, q = _minimum(frames, pose, q, robust, c)
+    pose, q = _minimum(frames, pose, q)
     s = frames.squared(pose, q)
-    _, weight, bend = loss(robust, s, c)
+    _, weight, bend = frames.losses(s)
     C_dd, C_dz = _profile(cost_derivatives(frames, pose, q, exact=True), weight, bend)
     S = implicit_covariance(C_dd, C_dz, np.concatenate([S1, S2]))
-    return Refined(pose, S, weight, pose.apply(q), s, free * len(q) - 6)
+    return Refined(pose, S, weight, pose.apply(q), s, frames.free * len(q) - 6)
 
 
 def _profile(f: Derivatives, weight: Array, bend: Array) -> tuple[Array, Array]:
@@ -226,13 +225,11 @@ def _minimum(
     frames: TwoFrames,
     pose: RelativePose,
     q: Array,
-    robust: Robust | None,
-    c: float,
 ) -> tuple[RelativePose, Array]:
     """Levenberg and Marquardt on pose and points, and Newton's steps near the minimum."""
     damping = 0.0
     newton = False
-    cost, weight, bend = _cost(frames, pose, q, robust, c)
+    rho, weight, bend = frames.losses(frames.squared(pose, q))
     for _ in range(STEPS):
         f = cost_derivatives(frames, pose, q, exact=newton)
         while True:
@@ -245,33 +242,21 @@ def _minimum(
             q_there = q + step_q
             if decrement < DECREMENT and damping < 1.0:
                 return there, q_there
-            reached, *losses = _cost(frames, there, q_there, robust, c)
-            if reached <= cost * (1.0 + SLACK):
+            losses = frames.losses(frames.squared(there, q_there))
+            if losses[0].sum() <= rho.sum() * (1.0 + SLACK):
                 break
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e12:
                 raise ConvergenceError("pose: no step lowers the cost; start nearer, or take the outliers out first")
         pose = there
         q = q_there
-        cost = reached
-        weight, bend = losses
+        rho, weight, bend = losses
         newton = decrement < NEAR
         if damping > 1e-8:
             damping *= 0.1
         else:
             damping = 0.0
     raise ConvergenceError(f"pose: no minimum in {STEPS} steps; start nearer, or take the outliers out first")
-
-
-def _cost(
-    frames: TwoFrames,
-    pose: RelativePose,
-    q: Array,
-    robust: Robust | None,
-    c: float,
-) -> tuple[float, Array, Array]:
-    rho, weight, bend = loss(robust, frames.squared(pose, q), c)
-    return 0.5 * rho.sum(), weight, bend
 
 
 def _step(
@@ -304,13 +289,23 @@ def _step(
 
 
 class TwoFrames(NamedTuple):
-    """Measurements of the same points in two frames."""
+    """Measurements of the same points in two frames, and the robust loss of their residuals."""
 
     measure: PointMatches | PixelMatches
     z1: Array  # (N, k)
     z2: Array  # (N, k)
     W1: Array  # (N, k, k), inverse covariance
     W2: Array  # (N, k, k)
+    robust: Robust | None = None
+
+    @property
+    def free(self) -> int:
+        """Dimensions of a point's residual, its position eliminated."""
+        return 2 * self.z1.shape[1] - 3
+
+    def losses(self, s: Array) -> tuple[Array, Array, Array]:
+        """rho, rho' and rho'' at the squared residuals s (N,), all (N,)."""
+        return loss(self.robust, s, threshold(self.free))
 
     def squared(self, pose: RelativePose, q: Array) -> Array:
         """2 f of each point, (N,), infinite where a point is not in front of the cameras."""

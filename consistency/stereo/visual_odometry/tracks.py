@@ -16,8 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.scenario import Belief, BelievedSensor
+from consistency.bench.scenario import Belief, BelievedSensor, models
 from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
@@ -258,26 +257,26 @@ def _points(z: Array, sensor: BelievedSensor) -> Array:
     """Observations (n, s) as points in the robot frame (n, 3), m; those of a sensor in the plane have height 0."""
     if sensor.model == "uvd":
         u, v, d = z.T
-        at = observation.triangulate(u, v, d, *sensor.rig)
+        at = models.triangulate(u, v, d, *sensor.rig)
     elif sensor.model == "range-bearing":
-        at = *observation.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
+        at = *models.at_range_bearing(z[:, 0], z[:, 1]), np.zeros(len(z))
     else:
         at = tuple(np.pad(z, ((0, 0), (0, 3 - sensor.size))).T)
-    return np.column_stack(observation.from_sensor(*at, sensor.mount.packed()))
+    return np.column_stack(models.from_sensor(*at, sensor.mount.packed()))
 
 
 def _expected(points: Array, sensor: BelievedSensor) -> tuple[Array, Array]:
     """Observations (n, s) of points (n, 3) in the robot frame, and their derivative (n, s, 3)."""
     mount = sensor.mount.packed()
     bx, by, bz = points.T
-    x, y, z = observation.to_sensor(bx, by, bz, mount)
+    x, y, z = models.to_sensor(bx, by, bz, mount)
     if sensor.model == "uvd":
         x = np.maximum(x, NEAREST)
-        seen = np.column_stack(observation.project(x, y, z, *sensor.rig))
-        slope = np.array(observation.project_jacobian(x, y, z, *sensor.rig)).reshape(3, 3, -1)
+        seen = np.column_stack(models.project(x, y, z, *sensor.rig))
+        slope = np.array(models.project_jacobian(x, y, z, *sensor.rig)).reshape(3, 3, -1)
     elif sensor.model == "range-bearing":
-        seen = np.column_stack(observation.range_bearing(x, y))
-        flat = np.array(observation.range_bearing_jacobian(x, y)).reshape(2, 2, -1)
+        seen = np.column_stack(models.range_bearing(x, y))
+        flat = np.array(models.range_bearing_jacobian(x, y)).reshape(2, 2, -1)
         slope = np.pad(flat, ((0, 0), (0, 1), (0, 0)))
     else:
         seen = np.column_stack([x, y, z])[:, : sensor.size]

@@ -209,7 +209,7 @@ def test_sources_that_the_bits_depend_on_count_and_others_do_not(tmp_path, monke
     monkeypatch.setattr(workers, "PACKAGE", tmp_path)
     errors_of_poses = tmp_path / "referee" / "geometry.py"
     errors_of_poses.parent.mkdir()
-    rooms = ("bench/models", "bench/scenario", "bench/simulation", "bench/filters")
+    rooms = ("bench/scenario", "bench/simulation.py", "bench/filters")
     for room in rooms:
         (tmp_path / room / "inner").mkdir(parents=True)
     seen = []

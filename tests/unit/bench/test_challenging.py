@@ -40,8 +40,7 @@ from consistency.bench.challenging.challenge import (
 )
 from consistency.bench.challenging.world_space import Choice, LogScale, Point, space_of
 from consistency.bench.runs.isolation import Isolation
-from consistency.bench.simulation import require_landmarks_in_view
-from consistency.bench.simulation.world import lap_length, planned_path
+from consistency.bench.simulation import lap_length, planned_path, require_landmarks_in_view
 from consistency.commands import main
 from consistency.referee.errors import InputError
 

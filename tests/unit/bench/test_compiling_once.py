@@ -19,7 +19,7 @@ from consistency.bench.filters.compiler.jit import remembered_types
 from consistency.bench.runs.isolation import Isolation
 from consistency.bench.runs.run_outcome import Simulated, TrialWork
 from consistency.bench.runs.workers import LocalThreads
-from consistency.bench.simulation.world import World
+from consistency.bench.simulation import World
 
 stack = targetconfig.ConfigStack
 Flags = compiler.Flags

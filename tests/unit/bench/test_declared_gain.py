@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import optimal_gain
+from consistency.bench.protocols import optimal_gain
 from consistency.bench.store.results import joined
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters.compiler.dispatch import fits, generic, implement, part, require_fitting
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import problem_of
 from consistency.bench.filters.methods.riekf import RightInvariant
 from consistency.bench.filters.methods.ukf import Unscented
 from consistency.bench.filters.parts.local import Local

@@ -11,12 +11,11 @@ from scenario_files import load, put
 
 import consistency as cs
 from consistency.bench.filters.run_filter import step_through
-from consistency.bench.models import observation
 from consistency.bench.runs.montecarlo import run_log, simulate_log
+from consistency.bench.scenario import models
 from consistency.bench.scenario.effects import EFFECTS, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.toml_tables import Count, Positive, Triple
-from consistency.bench.simulation import World, draw_landmarks, planned_controls
-from consistency.bench.simulation.world import purpose_of
+from consistency.bench.simulation import World, draw_landmarks, planned_controls, purpose_of
 from consistency.bench.store.parquet import observations_table
 from consistency.bench.store.recorded_log import read_log
 
@@ -150,9 +149,9 @@ def plainly(scenario, run, seed):
     landmarks, mount = draw_landmarks(truth), sensor.mount.packed()
     step, landmark, z = [], [], []
     for k, (x, y, heading) in enumerate(path, start=1):
-        p = np.stack(observation.to_sensor(*observation.to_robot(x, y, heading, *landmarks.T), mount))
+        p = np.stack(models.to_sensor(*models.to_robot(x, y, heading, *landmarks.T), mount))
         distance = np.linalg.norm(p, axis=0)
-        u, v, d = observation.project(*p, sensor.f, getattr(sensor, "B", 0.0))
+        u, v, d = models.project(*p, sensor.f, getattr(sensor, "B", 0.0))
         near = (distance >= sensor.range[0]) & (distance <= sensor.range[1]) & (p[0] > 0)
         width, height = sensor.image
         column, row = sensor.principal_point or (width / 2, height / 2)

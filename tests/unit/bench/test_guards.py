@@ -11,12 +11,12 @@ from mismatch import WrongMatch, corrupted
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import optimal_gain
 from consistency.bench.filters.guard import Guarded
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import build_report
 from consistency.bench.pages.sections.study_sections import rejections
+from consistency.bench.protocols import optimal_gain
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario import GuardSettings
 from consistency.bench.scenario.effects import EFFECTS

@@ -7,8 +7,9 @@ import pytest
 
 import consistency as cs
 from consistency.bench.filters import BOUNDS, filter_summaries, usable_names
-from consistency.bench.filters.filter_declarations import is_realisable, problem_for, problem_of
+from consistency.bench.filters.filter_inputs import problem_for, problem_of
 from consistency.bench.filters.run_filter import run_filter, step_through
+from consistency.bench.protocols import is_realisable
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.store.recorded_log import read_log
 

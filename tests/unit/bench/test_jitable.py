@@ -6,16 +6,16 @@ import sys
 import numba
 import pytest
 
-from consistency.bench.models import motion
+from consistency.bench.scenario import models
 
 
-@motion.jitable
+@models.jitable
 def doubled(x):
     return 2.0 * x
 
 
 def test_numba_knows_what_is_jitable_once_it_is_told():
-    motion.register_jitables()
+    models.register_jitables()
 
     @numba.njit
     def calls(x):

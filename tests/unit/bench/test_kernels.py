@@ -19,8 +19,7 @@ from consistency.bench.filters.compiled import one_blas_thread
 from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.loop import trial_kernel
 from consistency.bench.filters.run_filter import step_through
-from consistency.bench.models.motion import dead_reckoning
-from consistency.bench.models.observation import to_robot
+from consistency.bench.scenario.models import dead_reckoning, to_robot
 
 
 def test_no_kernel_is_a_closure():

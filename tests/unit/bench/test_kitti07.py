@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scripts import experiment
 
 import consistency as cs
-from consistency.bench.models.observation import project
+from consistency.bench.scenario.models import project
 from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.bench.types import Trial
 from consistency.referee.system import manifest_of

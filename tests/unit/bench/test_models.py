@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from consistency.bench.filters.believed_noise import sensor_noise
+from consistency.bench.filters.filter_inputs import sensor_noise
 from consistency.bench.filters.kernel import part_functions
 from consistency.bench.filters.kernel.part_functions import State
 from consistency.bench.filters.kernel.update_steps import (
@@ -18,9 +18,8 @@ from consistency.bench.filters.kernel.update_steps import (
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.methods.kf import Reference, place_about_reference
 from consistency.bench.filters.textbook.basics import PointSensor, motion_jacobians
-from consistency.bench.models import motion, observation
 from consistency.bench.protocols import Problem
-from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount, models
 from consistency.bench.types import Control
 
 F, B = 150.0, 0.09
@@ -51,26 +50,26 @@ def close(a, b, tolerance=1e-12):
 
 @given(METRES, METRES, ANGLE, st.floats(0.01, 1.0), st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
 def test_motion_jacobians(x, y, heading, dt, v, omega):
-    exact = complex_step(lambda p: motion.unicycle(*p, dt, v, omega), np.array([x, y, heading]))
-    assert close(np.array(motion.unicycle_jacobian(heading, dt, v)), exact[:2, 2])
-    G = complex_step(lambda c: motion.unicycle(x, y, heading, dt, *c), np.array([v, omega]))
+    exact = complex_step(lambda p: models.unicycle(*p, dt, v, omega), np.array([x, y, heading]))
+    assert close(np.array(models.unicycle_jacobian(heading, dt, v)), exact[:2, 2])
+    G = complex_step(lambda c: models.unicycle(x, y, heading, dt, *c), np.array([v, omega]))
     twin_F, twin_G = motion_jacobians(np.array([x, y, heading]), Control(dt, v, omega))
     assert close(twin_F, exact)
     assert close(twin_G, G)
-    xx, xy, yy, hh = motion.unicycle_noise(heading, dt, 0.3, 0.2)
+    xx, xy, yy, hh = models.unicycle_noise(heading, dt, 0.3, 0.2)
     assert close(np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, hh]]), G @ np.diag([0.09, 0.04]) @ G.T)
 
 
 def test_robot_drives_along_its_heading_and_turns_counter_clockwise():
-    assert np.allclose(motion.unicycle(1.0, 2.0, np.pi / 2, 0.5, 2.0, 0.4), (1.0, 3.0, np.pi / 2 + 0.2))
+    assert np.allclose(models.unicycle(1.0, 2.0, np.pi / 2, 0.5, 2.0, 0.4), (1.0, 3.0, np.pi / 2 + 0.2))
 
 
 def test_dead_reckoning_repeats_single_steps(rng):
     controls = np.column_stack([rng.uniform(0.05, 0.2, 40), rng.normal(size=(40, 2))])
-    path = motion.dead_reckoning(np.array([1.0, -2.0, 0.7]), controls)
+    path = models.dead_reckoning(np.array([1.0, -2.0, 0.7]), controls)
     pose = path[0]
     for k, control in enumerate(controls):
-        pose = np.array(motion.unicycle(*pose, *control))
+        pose = np.array(models.unicycle(*pose, *control))
         assert np.allclose(path[k + 1], pose, rtol=0, atol=1e-12)
 
 
@@ -79,25 +78,25 @@ def test_dead_reckoning_repeats_single_steps(rng):
 
 @given(AHEAD, METRES, METRES)
 def test_projection_jacobian(x, y, z):
-    exact = complex_step(lambda p: observation.project(*p, F, B), np.array([x, y, z]))
-    assert close(np.reshape(observation.project_jacobian(x, y, z, F, B), (3, 3)), exact)
+    exact = complex_step(lambda p: models.project(*p, F, B), np.array([x, y, z]))
+    assert close(np.reshape(models.project_jacobian(x, y, z, F, B), (3, 3)), exact)
 
 
 @given(PIXELS, PIXELS, DISPARITY)
 def test_triangulation_jacobian(u, v, d):
-    exact = complex_step(lambda p: observation.triangulate(*p, F, B), np.array([u, v, d]))
-    assert close(np.reshape(observation.triangulate_jacobian(u, v, d, F, B), (3, 3)), exact)
+    exact = complex_step(lambda p: models.triangulate(*p, F, B), np.array([u, v, d]))
+    assert close(np.reshape(models.triangulate_jacobian(u, v, d, F, B), (3, 3)), exact)
 
 
 @given(AHEAD, METRES, METRES)
 def test_triangulation_inverts_projection(x, y, z):
-    back = observation.triangulate(*observation.project(x, y, z, F, B), F, B)
+    back = models.triangulate(*models.project(x, y, z, F, B), F, B)
     assert np.allclose(back, (x, y, z), rtol=1e-12, atol=1e-12)
 
 
 def test_signs_of_pixels():
     """Left of the axis u < 0, above it v < 0, and the disparity is f B / x."""
-    u, v, d = observation.project(2.0, 0.5, 0.25, F, B)
+    u, v, d = models.project(2.0, 0.5, 0.25, F, B)
     assert (u, v, d) == (-37.5, -18.75, F * B / 2.0)
 
 
@@ -106,7 +105,7 @@ def test_published_nominal_pixel():
 
     The text prints d = 1.32 px; with its f = 150 px and B = 0.09 m, f B / x is 1.35 px.
     """
-    u, _, d = observation.project(10.0, 1.0, 0.0, F, B)
+    u, _, d = models.project(10.0, 1.0, 0.0, F, B)
     assert abs(u) == pytest.approx(15.0)
     assert d == pytest.approx(1.35)
 
@@ -116,21 +115,21 @@ def test_published_nominal_pixel():
 
 @given(METRES, METRES, ANGLE, METRES, METRES, METRES)
 def test_robot_frame_inverse(px, py, heading, lx, ly, lz):
-    back = observation.to_world(px, py, heading, *observation.to_robot(px, py, heading, lx, ly, lz))
+    back = models.to_world(px, py, heading, *models.to_robot(px, py, heading, lx, ly, lz))
     assert np.allclose(back, (lx, ly, lz), rtol=0, atol=1e-12 * 100)
 
 
 def test_robot_frame_signs():
     """A robot facing world +y: a point further along y is ahead, one at smaller x is to the right."""
-    assert np.allclose(observation.to_robot(1.0, 1.0, np.pi / 2, 1.0, 3.0, 0.5), (2.0, 0.0, 0.5))
-    assert np.allclose(observation.to_robot(1.0, 1.0, np.pi / 2, 2.0, 1.0, 0.0), (0.0, -1.0, 0.0))
+    assert np.allclose(models.to_robot(1.0, 1.0, np.pi / 2, 1.0, 3.0, 0.5), (2.0, 0.0, 0.5))
+    assert np.allclose(models.to_robot(1.0, 1.0, np.pi / 2, 2.0, 1.0, 0.0), (0.0, -1.0, 0.0))
 
 
 @given(METRES, METRES, METRES, ANGLE, st.floats(-1.5, 1.5), ANGLE)
 def test_mount_inverse(x, y, z, roll, pitch, heading):
     mount = Mount(position=(0.3, -0.2, 0.5), rotation=(roll, pitch, heading)).packed()
-    there = observation.to_sensor(x, y, z, mount)
-    assert np.allclose(observation.from_sensor(*there, mount), (x, y, z), rtol=0, atol=1e-11)
+    there = models.to_sensor(x, y, z, mount)
+    assert np.allclose(models.from_sensor(*there, mount), (x, y, z), rtol=0, atol=1e-11)
     assert np.linalg.norm(there) == pytest.approx(np.linalg.norm(np.subtract((x, y, z), mount[:3])), abs=1e-11)
 
 
@@ -215,9 +214,9 @@ def test_converted_noise_is_propagated_to_first_order(rng):
     z = np.column_stack([rng.uniform(-100, 100, (6, 2)), rng.uniform(2, 20, 6)])
     points, R = sensor_noise(z, sensor, converted=True)
     for i, measured in enumerate(z):
-        J = complex_step(lambda p: observation.triangulate(*p, F, B), measured)
+        J = complex_step(lambda p: models.triangulate(*p, F, B), measured)
         assert close(R[i], J @ np.diag(np.square(sensor.sigma)) @ J.T)
-        assert close(points[i], np.array(observation.triangulate(*measured, F, B)))
+        assert close(points[i], np.array(models.triangulate(*measured, F, B)))
     same, R = sensor_noise(z, sensor, converted=False)
     assert np.array_equal(same, z)
     assert np.array_equal(R, np.broadcast_to(np.diag(np.square(sensor.sigma)), (6, 3, 3)))

@@ -6,7 +6,7 @@ import pytest
 from ensemble import Ensemble
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import random_numbers
+from consistency.bench.filters.filter_inputs import random_numbers
 from consistency.bench.filters.run_filter import run_filter
 from consistency.diagnostics import Settings
 

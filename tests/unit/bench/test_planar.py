@@ -18,9 +18,9 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.methods.ekf import sensor_of
 from consistency.bench.filters.run_filter import step_through
-from consistency.bench.models import observation
 from consistency.bench.runs.reproduce_findings import sibling
 from consistency.bench.runs.run_outcome import is_flat
+from consistency.bench.scenario import models
 from consistency.bench.simulation import draw_landmarks
 from consistency.bench.store.recorded_log import read_log, write_log
 from consistency.diagnostics import map_score
@@ -38,11 +38,11 @@ def slope(function, at):
 
 @pytest.mark.parametrize("point", POINTS)
 def test_range_and_bearing_have_these_jacobians(point):
-    there = np.array(observation.range_bearing(*point))
-    assert np.allclose(observation.at_range_bearing(*there), point, rtol=0, atol=1e-15)
-    J = np.reshape(observation.range_bearing_jacobian(*point), (2, 2))
-    back = np.reshape(observation.at_range_bearing_jacobian(*there), (2, 2))
-    assert np.allclose(J, slope(lambda p: np.array(observation.range_bearing(*p)), point), rtol=0, atol=1e-8)
+    there = np.array(models.range_bearing(*point))
+    assert np.allclose(models.at_range_bearing(*there), point, rtol=0, atol=1e-15)
+    J = np.reshape(models.range_bearing_jacobian(*point), (2, 2))
+    back = np.reshape(models.at_range_bearing_jacobian(*there), (2, 2))
+    assert np.allclose(J, slope(lambda p: np.array(models.range_bearing(*p)), point), rtol=0, atol=1e-8)
     assert np.allclose(back, np.linalg.inv(J), rtol=0, atol=1e-14)
     assert there[1] == pytest.approx(np.angle(complex(*point)))  # counter-clockwise from x
 

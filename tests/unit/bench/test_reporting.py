@@ -25,9 +25,8 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import answer, build_report, compose
 from consistency.bench.pages.sections import (
-    anees,
     calibration_rates,
-    nees_distribution,
+    nees,
     nis,
     one_run,
 )
@@ -196,8 +195,8 @@ def test_the_model_is_what_analyse_says(folder):
     results = read_results(folder)
     by_filter, (study,) = cs.analyse(results), build_report(folder).studies
     parts = zip(
-        anees.read(study).curves, map(one_run.pose_error_series, study.tracks),
-        one_run.read(study).paths, strict=True,
+        nees.anees_of(study).curves, map(one_run.pose_error_series, study.tracks),
+        one_run.world_of(study).paths, strict=True,
     )  # fmt: skip
     for track, (curve, error, (_, path)) in zip(study.tracks, parts, strict=True):
         verdict = by_filter[track.name]
@@ -217,9 +216,9 @@ def test_the_model_is_what_analyse_says(folder):
 def test_the_odometry_is_that_of_the_trial(report, uvd):
     (study,) = report.studies
     trial = cs.simulate(uvd, run=0, seed=1)
-    assert_array_equal(one_run.read(study).truth, trial.truth[:, :2])
+    assert_array_equal(one_run.world_of(study).truth, trial.truth[:, :2])
     step = trial.controls[0, 0] * trial.controls[0, 1]
-    odometry = one_run.read(study).odometry
+    odometry = one_run.world_of(study).odometry
     assert_allclose(np.linalg.norm(odometry[1] - odometry[0]), abs(step))
 
 
@@ -267,7 +266,7 @@ def test_the_diagnosis_is_what_the_verdict_holds(report):
         assert by_name["ratio"][ratio_figures.WHOLE][number] == v.scale.inflation
         assert by_name["coverage"]["y"][number][0] == pytest.approx(100 * v.accuracy.coverage_one_step[1])
         assert by_name["bias"]["heading"][number] == v.bias.by_axis["heading"]
-        of = nees_distribution.steps(track)
+        of = nees.steps(track)
         assert_array_equal(of.x[1:-1], v.tails.pit)
         assert_allclose(of.y, [0, 0.25, 0.5, 0.75, 1, 1])
         assert nis.lags(track) is None  # four runs of 60 steps have too few innovations
@@ -347,7 +346,9 @@ def test_nees_alone_without_axes(report):
 def test_the_captions_state_the_rates_in_force(report):
     v = report.studies[0].tracks[0].verdict
     (share,) = (a.share for a in v.answers if a.question == STEP)
-    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in anees.anees_caption(anees.read(report.studies[0]))
+    assert f"at most {100 * share * v.settings.false_alarm:.2g} %" in nees.anees_caption(
+        nees.anees_of(report.studies[0])
+    )
     assert "probability 5 % at most" in verdicts.method(report.studies)
     assert "two one-sided tests, each at 5 %, put the ratio of true to stated covariance between 0.67 and 1.50" in (
         verdicts.method(report.studies)
@@ -533,7 +534,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     assert study.until_decided
     assert (kf.verdict.runs, wrong.verdict.runs) == (24, 12)
     assert wrong.verdict.status == "overconfident"
-    curves = anees.read(study)
+    curves = nees.anees_of(study)
     assert curves.common.track is kf
     assert [curve.own_band for curve in curves.curves] == [False, True]
     assert study.failures == [("small", 20, 30, "diverged")]  # after the look that decided, and still listed
@@ -541,7 +542,7 @@ def test_a_run_until_decided_shows_each_verdict_at_its_look(linear, tmp_path):
     first = results.estimates[results.estimates["run"] < 12].groupby("step")
     assert_allclose(study.tracks[1].nis_ratio, first["nis"].sum() / first["nis_dof"].sum().replace(0, np.nan))
     assert "kf after 24 runs and small after 12 runs" in verdicts.verdicts_caption(study)
-    assert "Average NEES over 24 runs" in anees.anees_caption(anees.read(study))
+    assert "Average NEES over 24 runs" in nees.anees_caption(nees.anees_of(study))
     assert "judged by an e-process" in verdicts.method(report.studies)
     assert "they are listed below and counted in the verdicts that looked at them" in compose(report).answer
     assert "asks scale alone" in questions_table.marks_caption(study)
@@ -554,8 +555,8 @@ def test_the_common_band_is_that_of_most_runs_and_then_of_fewest_failures():
         judge(make_record("any", error[:runs], P[:runs], failures=failures))
         for runs, failures in ((24, lost), (12, ()), (24, ()))
     )
-    assert anees.common({"early": early, "late": late}) is late
-    assert anees.common({"late": late, "whole": whole, "early": early}) is whole
+    assert nees.common({"early": early, "late": late}) is late
+    assert nees.common({"late": late, "whole": whole, "early": early}) is whole
 
 
 def test_runs_of_a_fixed_number_say_nothing_of_looks(report):
@@ -648,7 +649,7 @@ def test_the_calibration_is_a_table_of_promises_with_the_interval_of_the_worst_w
     path.write_text(json.dumps(CALIBRATION))
     found = calibration_rates.calibration(path)
     assert found.gates == 600
-    (first, (alarm,)), (second, (power, decided)) = calibration_rates.groups(found)
+    (first, (alarm,)), (second, (power, decided)) = calibration_rates.promise_groups(found)
     assert (first, second) == ("false alarm: a right filter is found at fault", "power: plan keeps its word")
     # Clopper & Pearson of 9 in 200 at 99 %
     low, high = stats.beta.ppf(0.005, 9, 192), stats.beta.ppf(0.995, 10, 191)
@@ -742,7 +743,7 @@ def test_odd_names_are_shown_literally_and_failed_runs_are_listed(results, tmp_p
     (study,) = report.studies
     assert len(study.failures) == 6
     assert study.tracks[1].verdict.status == "failed"
-    assert not np.isfinite(one_run.read(study).paths[1][1]).any()
+    assert not np.isfinite(one_run.world_of(study).paths[1][1]).any()
     assert "6 of 8 runs" in compose(report).answer
 
 
@@ -757,10 +758,10 @@ def test_only_failed_runs_give_a_filter_bands_of_its_own(results, tmp_path):
         tmp_path / "run"
     )
     report = build_report(tmp_path / "run")
-    curves = anees.read(report.studies[0])
+    curves = nees.anees_of(report.studies[0])
     assert [curve.own_band for curve in curves.curves] == [True, False]
     assert curves.common.track.name == "ekf-uvd"
-    assert "Fewer runs carry the curve of ekf-xyz" in anees.anees_caption(curves)
+    assert "Fewer runs carry the curve of ekf-xyz" in nees.anees_caption(curves)
 
 
 def test_html_loads_nothing_and_is_small(page_of_results):
@@ -932,7 +933,7 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
         (curve,) = lines(axes, track.name)
         assert_array_equal(curve.get_ydata(), track.verdict.scale.anees)
         assert curve.get_gid() == f"filter:{track.tag}"
-    common = anees.read(study).common
+    common = nees.anees_of(study).common
     assert shaded(axes) == (np.nanmin(common.band), np.nanmax(common.band))
     (band,) = lines(axes, "band of all steps at once")
     assert_array_equal(band.get_ydata(), common.simultaneous[:, 0])
@@ -942,22 +943,22 @@ def test_the_anees_is_drawn_with_the_bands_of_the_study(report):
 def test_runs_that_decide_the_average_are_told_and_left_out_of_a_thin_curve(report):
     (study,) = report.studies
     track = study.tracks[0]
-    nees = track.record().errors.nees.copy()
-    nees[[0, 2]] *= 1e4
+    far_nees = track.record().errors.nees.copy()
+    far_nees[[0, 2]] *= 1e4
     scale = replace(track.verdict.scale, median_run=2.5, worst_run=3e4, mean_anees=4321.0)
     verdict = replace(track.verdict, scale=scale)
-    far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=nees))
+    far = replace(track, verdict=verdict, record=lambda: changed(track.record(), nees=far_nees))
     with_far = replace(study, tracks=(far, *study.tracks[1:]))
-    curves = anees.read(with_far).curves
+    curves = nees.anees_of(with_far).curves
     assert [curve.far for curve in curves] == [2] + [0] * (len(curves) - 1)
-    others = np.ma.masked_invalid(np.delete(nees, [0, 2], axis=0)).mean(axis=0)
+    others = np.ma.masked_invalid(np.delete(far_nees, [0, 2], axis=0)).mean(axis=0)
     assert_allclose(curves[0].others, others.filled(np.nan))
-    (figure,) = anees.anees_curves(with_far)
+    (figure,) = nees.anees_curves(with_far)
     assert f" 2 runs of {verdict.runs} decide the average of {track.name}, 4321 over all steps" in figure.caption
     (axes,) = panels(figure)
     (thin,) = lines(axes, f"{track.name} without 2 runs")
     assert_array_equal(thin.get_ydata(), curves[0].others)
-    assert "decide" not in anees.anees_caption(anees.read(study))
+    assert "decide" not in nees.anees_caption(nees.anees_of(study))
 
 
 def test_pose_errors_have_a_row_for_each_filter(report):
@@ -978,7 +979,7 @@ def test_pose_errors_have_a_row_for_each_filter(report):
 
 def test_the_map_shows_truth_and_estimates(report):
     (study,) = report.studies
-    found = one_run.read(study)
+    found = one_run.world_of(study)
     (axes,) = panels(by_title(compose(report))["Scenario and estimates, run 0"])
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "y (m)")
     (truth,), (odometry,) = lines(axes, "true path"), lines(axes, "odometry alone")
@@ -1056,7 +1057,7 @@ def test_a_log_without_truth_says_so(uvd, tmp_path):
     report = build_report(tmp_path / "run")
     (study,) = report.studies
     assert not study.has_truth
-    assert one_run.read(study).odometry is None
+    assert one_run.world_of(study).odometry is None
     assert str(tmp_path) not in study.name
     source = shown(report)
     assert "The truth of log is not known" in source

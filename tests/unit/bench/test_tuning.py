@@ -12,7 +12,7 @@ from documents import ROOT
 from scipy import stats
 
 import consistency as cs
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import problem_of
 from consistency.bench.filters.run_filter import run_filter, step_through
 from consistency.bench.store.recorded_log import Log
 from consistency.bench.tuning.noise_factor_fit import (

@@ -199,7 +199,7 @@ def test_errors_that_outlast_a_window(weights, expected):
     yaw = sum(weight * white[k : k + len(w.drive)] for k, weight in enumerate(weights))
     moved = np.zeros((len(w.drive), 3))
     moved[:, 2] = yaw
-    true = w.motions @ sides.poses(moved)
+    true = w.motions @ sides.matrices_of(moved)
     assert errors_._lasts(replace(w, true=true)) == expected
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from consistency.bench.filters.kernel.part_functions import Frame, world_point
 from consistency.bench.filters.methods.equivariant import SensorPoint
 from consistency.bench.filters.parts.invariant_pose import exponential, left_jacobian, move_pose, shifted_covariance
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.geometry import pose_error, rotation, wrap
 
 

@@ -8,7 +8,7 @@ from invariant import Invariant
 import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.bench.pages.results_report import build_report
-from consistency.bench.pages.sections import anees
+from consistency.bench.pages.sections import nees
 from consistency.bench.pages.sections.study_sections import maps, of_own_errors, own_error_table
 from consistency.referee.pages import verdicts
 from consistency.referee.show.blocks import Name, Quantity, Status, Table, brief, written
@@ -52,9 +52,9 @@ def test_both_errors_stand_below_each_other(study):
 
 def test_captions_name_the_filters_with_an_error_of_their_own(study):
     assert "Judged in an error of their own, but for the RMSE: right (right)" in verdicts.verdicts_caption(study)
-    assert anees.anees_caption(anees.read(study)).endswith("In the filter's own error: right (right).")
+    assert nees.anees_caption(nees.anees_of(study)).endswith("In the filter's own error: right (right).")
     alone = replace(study, tracks=study.tracks[:1])
-    assert "own" not in anees.anees_caption(anees.read(alone)).replace("shown", "")
+    assert "own" not in nees.anees_caption(nees.anees_of(alone)).replace("shown", "")
     assert "error of their own" not in verdicts.verdicts_caption(alone)
     assert own_error_table(alone) == ()
 

@@ -8,8 +8,7 @@ import pytest
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from consistency.bench.models import observation
-from consistency.bench.scenario import Mount, PicturedSensor
+from consistency.bench.scenario import Mount, PicturedSensor, models
 from consistency.bench.simulation import simulate
 from consistency.referee.errors import InputError
 from consistency.stereo.characterising.boards import (
@@ -50,7 +49,7 @@ def seen_of(rng, tracks, length, rho=0.0, sigma=SIGMA, still=False):
     e = rng.standard_normal((tracks, length, 3))
     for i in range(1, length):
         e[:, i] = rho * e[:, i - 1] + np.sqrt(1 - rho**2) * e[:, i]
-    values = np.stack(observation.project(x, y, z, F, B), axis=-1) + e.reshape(-1, 3) * sigma
+    values = np.stack(models.project(x, y, z, F, B), axis=-1) + e.reshape(-1, 3) * sigma
     return Sightings(values, R, t, track, k, np.full(len(k), not still))
 
 
@@ -66,7 +65,7 @@ def test_residuals_and_leverages_are_those_of_dense_least_squares(rng):
 
     def predicted(point):
         local = np.einsum("nji,nj->in", seen.R[own], point - seen.t[own])
-        return np.stack(observation.project(*local, F, B), axis=-1).ravel()
+        return np.stack(models.project(*local, F, B), axis=-1).ravel()
 
     point = np.array([3.0, 0.0, 0.0])
     for _ in range(30):
@@ -199,7 +198,7 @@ def test_points_and_poses_together_are_where_least_squares_has_them(rng):
         poses, points = x[:24].reshape(4, 6)[seen.step], x[24:].reshape(12, 3)[seen.track]
         turn = seen.R @ Rotation.from_rotvec(poses[:, 3:]).as_matrix()
         local = np.einsum("nji,nj->in", turn, points - seen.t - poses[:, :3])
-        return np.asarray(((seen.z - np.stack(observation.project(*local, F, B), axis=-1)) / fitted.sigma).ravel())
+        return np.asarray(((seen.z - np.stack(models.project(*local, F, B), axis=-1)) / fitted.sigma).ravel())
 
     start = np.concatenate([np.zeros(24), np.tile([6.0, 0.0, 0.0], 12)])
     best = optimize.least_squares(misfit, start, x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-12)
@@ -221,7 +220,7 @@ def test_a_log_is_seen_from_the_mount_of_its_sensor(uvd, tilted):
     assert len(seen.z) == 2 * len(trial.z)
     points = trial.landmarks[seen.track % trial.n_landmarks]
     local = np.einsum("nji,nj->in", seen.R, points - seen.t)
-    assert np.allclose(np.stack(observation.project(*local, 150.0, 0.09), axis=-1), seen.z, atol=1e-5)
+    assert np.allclose(np.stack(models.project(*local, 150.0, 0.09), axis=-1), seen.z, atol=1e-5)
     assert len(np.unique(seen.track)) == 2 * len(np.unique(trial.landmark))
 
 
@@ -246,7 +245,7 @@ def boards(rng, n):
 def test_the_noise_of_corners_is_that_about_their_plane(rng):
     """Boards of nine corners: a pose takes 6 of 27 degrees of freedom, more than chance explains."""
     nine = np.isin(board()[:, 0], [0.0, 0.12, 0.24]) & np.isin(board()[:, 1], [0.0, 0.06, 0.15])
-    ideal = np.stack([np.stack(observation.project(*points[nine].T, F, B), axis=-1) for points in boards(rng, 120)])
+    ideal = np.stack([np.stack(models.project(*points[nine].T, F, B), axis=-1) for points in boards(rng, 120)])
     z = ideal + rng.standard_normal(ideal.shape) * SIGMA
     calibrated = BoardCalibration("full", z, np.zeros(z.shape[:2]), F, B, (0.0, 0.0), (0.0, 0.0, 0.0), 0)
     data = residuals_about_boards(calibrated, board()[nine])

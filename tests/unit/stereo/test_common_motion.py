@@ -8,8 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import consistency as cs
-from consistency.bench.models import observation
-from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount
+from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount, models
 from consistency.bench.store.recorded_log import Log
 from consistency.bench.types import Trial
 from consistency.referee.pages.write_pages import facts
@@ -30,11 +29,11 @@ SENSORS = {
 
 def seen_by(sensor, pose, places):
     """What a sensor of a robot at ``pose`` measures of points (n, 3), without noise."""
-    x, y, z = observation.to_sensor(*observation.to_robot(*pose, *places.T), sensor.mount.packed())
+    x, y, z = models.to_sensor(*models.to_robot(*pose, *places.T), sensor.mount.packed())
     if sensor.model == "uvd":
-        return np.column_stack(observation.project(x, y, z, sensor.f, sensor.B))
+        return np.column_stack(models.project(x, y, z, sensor.f, sensor.B))
     if sensor.model == "range-bearing":
-        return np.column_stack(observation.range_bearing(x, y))
+        return np.column_stack(models.range_bearing(x, y))
     return np.column_stack([x, y, z])[:, : sensor.size]
 
 

@@ -341,7 +341,7 @@ def test_stages_are_known_by_name():
 )
 def test_a_stage_that_does_not_exist_is_refused(role, name, settings, message):
     with pytest.raises(cs.InputError, match=message):
-        stage(role, name, **settings)
+        stage(role, name, settings)
 
 
 def test_a_search_that_misses_the_scene_is_refused():

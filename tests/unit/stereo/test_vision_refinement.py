@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rigs import MOTION, RIG
+from scipy import stats
 
 from consistency.referee.errors import InputError
 from consistency.stereo.visual_odometry import maximum_likelihood as module
@@ -59,6 +61,19 @@ def test_an_outlier_loses_its_weight(robust, matches):
     error, without = (np.linalg.norm(r.pose.t - clean.pose.t) for r in (found, plain))
     assert error < 0.5 * without
     assert found.weights[:3].max() < 0.3 < 0.6 < np.median(found.weights)
+
+
+def test_weights_are_those_of_a_residual_that_an_honest_point_exceeds_in_one_of_twenty(matches):
+    """Huber's weight c / sqrt(s) beyond c; the points cost 3 of 8 equations, or of 6."""
+    uv1, uv2 = matches
+    p1, p2 = triangulate(RIG, uv1), triangulate(RIG, uv2)
+    S1, S2 = triangulation_covariance(RIG, uv1, S), triangulation_covariance(RIG, uv2, S)
+    pixels = refine_reprojection(RIG, uv1, uv2, initial(uv1, uv2), 0.3 * S, robust="huber")
+    points = register_weighted(p1, p2, 0.3 * S1, 0.3 * S2, robust="huber")
+    for found, free in ((pixels, 5), (points, 3)):
+        expected = np.minimum(1.0, np.sqrt(stats.chi2.isf(0.05, free) / found.residuals))
+        assert (expected < 1.0).any()
+        assert_allclose(found.weights, expected)
 
 
 def test_matches_must_fit(matches):

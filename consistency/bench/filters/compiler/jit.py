@@ -43,7 +43,7 @@ from numba.core.types import functions
 from numba.extending import intrinsic, register_jitable
 
 from consistency.bench.filters.compiler.dispatch import BODIES, INNER, OPTIONS, PARTS, ROUTINES, Function
-from consistency.bench.models import motion
+from consistency.bench.scenario import models
 from consistency.referee.system import away_from_signals
 
 _result: Any = CompileResult  # untyped
@@ -139,7 +139,7 @@ class Kernel:
         return Outlook(content.key, is_ready, is_shared, content.size)
 
     def _content(self, signature: tuple[Any, ...]) -> Content:
-        motion.register_jitables()
+        models.register_jitables()
         return Content(self.function, signature)
 
     def _made(self, signature: tuple[Any, ...]) -> Any:

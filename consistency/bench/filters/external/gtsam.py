@@ -38,15 +38,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from consistency.bench.filters.believed_noise import bias_at, disparity_sigma
-from consistency.bench.filters.filter_declarations import problem_of
+from consistency.bench.filters.filter_inputs import bias_at, disparity_sigma, problem_of
 from consistency.bench.filters.kernel.linalg import definiteness
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.filters.textbook.inverse_range import unit_vectors, untruncated_disparity
-from consistency.bench.models import observation
 from consistency.bench.protocols import Problem
-from consistency.bench.scenario import Belief
+from consistency.bench.scenario import Belief, models
 from consistency.bench.types import Control, Estimates, Gaussian, Map, Observation, Trial
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Failure
@@ -229,9 +227,9 @@ class PlanarStereo:
         """(u, v, d) (m, 3) of points q / rho, and the Jacobians by q (m, 3, 3) and by rho (m, 3)."""
         f, B = self.problem.belief.sensor.f or 0.0, self.problem.belief.sensor.B or 0.0
         x, y, h = q.T
-        z = np.array(observation.project(x, y, h, f, B)).T
+        z = np.array(models.project(x, y, h, f, B)).T
         z[:, 2:] *= rho
-        by_q = np.moveaxis(np.reshape(observation.project_jacobian(x, y, h, f, B), (3, 3, -1)), -1, 0)
+        by_q = np.moveaxis(np.reshape(models.project_jacobian(x, y, h, f, B), (3, 3, -1)), -1, 0)
         by_q[:, 2] *= rho
         by_rho = np.zeros((len(q), 3))
         by_rho[:, 2] = f * B / q[:, 0]
@@ -240,7 +238,7 @@ class PlanarStereo:
     def _points(self, z: Array) -> Array:
         sensor = self.problem.belief.sensor
         u, v, d = z.T
-        return np.array(observation.triangulate(u, v, d, sensor.f or 0.0, sensor.B or 0.0)).T
+        return np.array(models.triangulate(u, v, d, sensor.f or 0.0, sensor.B or 0.0)).T
 
     def _unsearched(self, d: Array, expected: Array, sigma: Array | float, shift: Array) -> tuple[Array, Array]:
         """Disparities (m,) and their variances without the search range, where there is one.

@@ -30,7 +30,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from consistency.bench.filters.compiler.dispatch import routine
 from consistency.bench.filters.compiler.jit import inner
-from consistency.bench.models.motion import jitable
+from consistency.bench.scenario.models import jitable
 from consistency.referee.types import Array, Indices
 
 SMALL = 512  # size up to which strips of dgemm are faster than dsyrk; measured with OpenBLAS

@@ -28,8 +28,7 @@ from consistency.bench.filters.kernel.linalg import (
     matrix,
     vector,
 )
-from consistency.bench.models.motion import unicycle, unicycle_jacobian, unicycle_noise
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario.models import Mounting, unicycle, unicycle_jacobian, unicycle_noise
 from consistency.referee.types import Array, Indices
 
 Pair = tuple[float, float]

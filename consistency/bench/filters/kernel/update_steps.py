@@ -59,7 +59,7 @@ from consistency.bench.filters.kernel.part_functions import (
     to_error,
     wrap_residual,
 )
-from consistency.bench.models import observation
+from consistency.bench.scenario import models
 from consistency.referee.types import Array, Indices
 
 OfUpdate = TypeVar("OfUpdate", covariant=True)
@@ -129,7 +129,7 @@ def make_scratch(slam: Slam, n: int, m: int, steps: int, labels: int) -> Scratch
 def observe(slam: Slam, frame: Frame, values: Array, z: Array) -> None:
     """z (s,) <- h: the landmark ``values`` (w,) as the sensor of a robot at ``frame`` sees it."""
     bx, by, bz = to_body(slam.landmark, frame, values)
-    cx, cy, cz = observation.to_sensor(bx, by, bz, slam.sensor.mount)
+    cx, cy, cz = models.to_sensor(bx, by, bz, slam.sensor.mount)
     expected = measure(slam.sensor, cx, cy, cz)
     for i in range(observed_width(slam.sensor)):
         z[i] = expected[i]
@@ -140,7 +140,7 @@ def linearise_at(slam: Slam, frame: Frame, values: Array, z: Array, Hp: Array, H
     """z (s,), Hp (s, 3), Hl (s, w) <- h at ``frame`` and ``values`` (w,), and its Jacobians by variables of both."""
     body = to_body(slam.landmark, frame, values)
     mount = slam.sensor.mount
-    cx, cy, cz = observation.to_sensor(body[0], body[1], body[2], mount)
+    cx, cy, cz = models.to_sensor(body[0], body[1], body[2], mount)
     expected = measure(slam.sensor, cx, cy, cz)
     for i in range(observed_width(slam.sensor)):
         z[i] = expected[i]
@@ -183,7 +183,7 @@ def place_observed(slam: Slam, pose: Array, z: Array, values: Array, scratch: Sc
     """values (w,) <- inverse of h at ``pose`` (3,) for z (s,); ``scratch.Jp`` (w, 3), ``Jz`` (w, s) <- Jacobians."""
     mount, Jb, s = slam.sensor.mount, scratch.Jb, observed_width(slam.sensor)
     cx, cy, cz = locate(slam.sensor, z)
-    body = observation.from_sensor(cx, cy, cz, mount)
+    body = models.from_sensor(cx, cy, cz, mount)
     J = locate_jacobian(slam.sensor, z)
     for j in range(s):
         Jb[0, j] = mount.xx * J[j] + mount.xy * J[s + j] + mount.xz * J[2 * s + j]

@@ -23,7 +23,7 @@ from consistency.bench.filters.kernel.part_functions import (
 )
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook.anchored import AnchoredKalman
-from consistency.bench.models.observation import Mounting, turned_to_robot
+from consistency.bench.scenario.models import Mounting, turned_to_robot
 from consistency.referee.types import Array
 
 

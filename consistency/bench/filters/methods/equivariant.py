@@ -58,9 +58,9 @@ from consistency.bench.filters.parts.inverse_range import inward, outward
 from consistency.bench.filters.parts.sensors import Uvd
 from consistency.bench.filters.parts.world_point import combine_world_point
 from consistency.bench.filters.textbook.equivariant import EquivariantKalman
-from consistency.bench.models import observation
-from consistency.bench.models.observation import Mounting
 from consistency.bench.protocols import Problem
+from consistency.bench.scenario import models
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.types import Array
 
 
@@ -88,7 +88,7 @@ def sensor_point_width(landmark: SensorPoint) -> int:
 
 @implement(to_body, SensorPoint)
 def to_body_of_sensor_point(landmark: SensorPoint, frame: Frame, values: Array) -> Triple:
-    return observation.from_sensor(values[0], values[1], values[2], landmark.mount)
+    return models.from_sensor(values[0], values[1], values[2], landmark.mount)
 
 
 @implement(to_body_jacobian, SensorPoint)
@@ -104,7 +104,7 @@ def insert_sensor_point(
     landmark: SensorPoint, frame: Frame, body: Triple, Jb: Array, mount: Mounting, values: Array, Jp: Array, Jz: Array
 ) -> None:
     """``Jz`` (3, 3) is that of the polar error."""
-    values[0], values[1], values[2] = observation.to_sensor(body[0], body[1], body[2], mount)
+    values[0], values[1], values[2] = models.to_sensor(body[0], body[1], body[2], mount)
     e, r = sight(values)
     fill_matrix(Jp, 0.0)
     for j in range(3):
@@ -118,8 +118,8 @@ def sensor_point_in_world(
     landmark: SensorPoint, frame: Frame, values: Array, point_: Array, Dp: Array, Dl: Array
 ) -> None:
     mount, c, s = landmark.mount, frame.c, frame.s
-    bx, by, bz = observation.from_sensor(values[0], values[1], values[2], mount)
-    point_[0], point_[1], point_[2] = observation.turned_to_world(frame.x, frame.y, c, s, bx, by, bz)
+    bx, by, bz = models.from_sensor(values[0], values[1], values[2], mount)
+    point_[0], point_[1], point_[2] = models.turned_to_world(frame.x, frame.y, c, s, bx, by, bz)
     fill_matrix(Dp, 0.0)
     Dp[0, 0] = Dp[1, 1] = 1.0
     Dp[0, 2], Dp[1, 2] = frame.y - point_[1], point_[0] - frame.x
@@ -167,10 +167,10 @@ def _move_landmark(mount: Mounting, before: Frame, after: Frame, q: Array, F: Ar
     ``B`` (3, 3) <- derivative of the error by the position in the new frame of the robot, which is returned.
     """
     old, r_old = sight(q)
-    bx, by, bz = observation.from_sensor(q[0], q[1], q[2], mount)
-    wx, wy, wz = observation.turned_to_world(before.x, before.y, before.c, before.s, bx, by, bz)
-    body = observation.turned_to_robot(after.x, after.y, after.c, after.s, wx, wy, wz)
-    q[0], q[1], q[2] = observation.to_sensor(body[0], body[1], body[2], mount)
+    bx, by, bz = models.from_sensor(q[0], q[1], q[2], mount)
+    wx, wy, wz = models.turned_to_world(before.x, before.y, before.c, before.s, bx, by, bz)
+    body = models.turned_to_robot(after.x, after.y, after.c, after.s, wx, wy, wz)
+    q[0], q[1], q[2] = models.to_sensor(body[0], body[1], body[2], mount)
     new, r = sight(q)
     c, s = after.c * before.c + after.s * before.s, after.s * before.c - after.c * before.s
     for a in range(3):

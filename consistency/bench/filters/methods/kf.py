@@ -31,8 +31,8 @@ from consistency.bench.filters.kernel.update_steps import Scratch, linearise_at
 from consistency.bench.filters.methods import ekf
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.kf import LinearKalman
-from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.protocols import Problem
+from consistency.bench.scenario.models import dead_reckoning
 from consistency.referee.types import Array
 
 

@@ -45,9 +45,9 @@ from consistency.bench.filters.parts.sensors import (
     three_values,
 )
 from consistency.bench.filters.textbook.triangulated import TriangulatedKalman
-from consistency.bench.models import observation
-from consistency.bench.models.observation import Mounting
 from consistency.bench.protocols import Problem
+from consistency.bench.scenario import models
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.types import Array
 
 
@@ -122,8 +122,8 @@ def _add_noise(noise: NoiseAtPrediction, data: Data, m: int, y: Array, scratch: 
         first = 3 * i
         p = scratch.zhat[first : first + 3]
         if p[0] > 0.0:
-            u, v, d = observation.project(p[0], p[1], p[2], noise.f, noise.B)
-            J = observation.triangulate_jacobian(u, v, d, noise.f, noise.B)
+            u, v, d = models.project(p[0], p[1], p[2], noise.f, noise.B)
+            J = models.triangulate_jacobian(u, v, d, noise.f, noise.B)
             ratio = ratio_at(noise.growth, d)
             variance = (noise.su**2, noise.sv**2, (noise.sd * ratio) ** 2)
             share = (noise.rho * ratio * p[0]) ** 2

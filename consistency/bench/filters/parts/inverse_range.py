@@ -18,7 +18,7 @@ from consistency.bench.filters.compiler.jit import inner
 from consistency.bench.filters.kernel.linalg import fill_matrix
 from consistency.bench.filters.kernel.part_functions import Frame, Nine, Triple, landmark_width, world_point
 from consistency.bench.filters.parts.sensors import Growth, Uvd, ratio_at
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.types import Array
 
 BESIDE = 0.1  # cosine of the angle to the optical axis below which a prediction is in no image

@@ -20,9 +20,8 @@ from consistency.bench.filters.kernel.part_functions import (
     observed_width,
     wrap_residual,
 )
-from consistency.bench.models import observation
-from consistency.bench.models.observation import Mounting
-from consistency.bench.scenario import BelievedSensor
+from consistency.bench.scenario import BelievedSensor, models
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.types import Array
 
 
@@ -121,22 +120,22 @@ def locate_xyz_jacobian(sensor: Xyz, z: Array) -> Nine:
 
 @implement(measure, Uvd)
 def measure_uvd(sensor: Uvd, x: float, y: float, z: float) -> Triple:
-    return observation.project(x, y, z, sensor.f, sensor.B)
+    return models.project(x, y, z, sensor.f, sensor.B)
 
 
 @implement(measure_jacobian, Uvd)
 def measure_uvd_jacobian(sensor: Uvd, x: float, y: float, z: float) -> Nine:
-    return observation.project_jacobian(x, y, z, sensor.f, sensor.B)
+    return models.project_jacobian(x, y, z, sensor.f, sensor.B)
 
 
 @implement(locate, Uvd)
 def locate_uvd(sensor: Uvd, z: Array) -> Triple:
-    return observation.triangulate(z[0], z[1], z[2], sensor.f, sensor.B)
+    return models.triangulate(z[0], z[1], z[2], sensor.f, sensor.B)
 
 
 @implement(locate_jacobian, Uvd)
 def locate_uvd_jacobian(sensor: Uvd, z: Array) -> Nine:
-    return observation.triangulate_jacobian(z[0], z[1], z[2], sensor.f, sensor.B)
+    return models.triangulate_jacobian(z[0], z[1], z[2], sensor.f, sensor.B)
 
 
 @implement(measure, RelativeXy)
@@ -166,22 +165,22 @@ def wrap_bearing(sensor: RangeBearing, z: Array, about: Array) -> None:
 
 @implement(measure, RangeBearing)
 def measure_range_bearing(sensor: RangeBearing, x: float, y: float, z: float) -> Pair:
-    return observation.range_bearing(x, y)
+    return models.range_bearing(x, y)
 
 
 @implement(measure_jacobian, RangeBearing)
 def measure_range_bearing_jacobian(sensor: RangeBearing, x: float, y: float, z: float) -> Six:
-    rx, ry, bx, by = observation.range_bearing_jacobian(x, y)
+    rx, ry, bx, by = models.range_bearing_jacobian(x, y)
     return rx, ry, 0.0, bx, by, 0.0
 
 
 @implement(locate, RangeBearing)
 def locate_range_bearing(sensor: RangeBearing, z: Array) -> Triple:
-    x, y = observation.at_range_bearing(z[0], z[1])
+    x, y = models.at_range_bearing(z[0], z[1])
     return x, y, 0.0
 
 
 @implement(locate_jacobian, RangeBearing)
 def locate_range_bearing_jacobian(sensor: RangeBearing, z: Array) -> Six:
-    xr, xb, yr, yb = observation.at_range_bearing_jacobian(z[0], z[1])
+    xr, xb, yr, yb = models.at_range_bearing_jacobian(z[0], z[1])
     return xr, xb, yr, yb, 0.0, 0.0

@@ -16,8 +16,8 @@ from consistency.bench.filters.kernel.part_functions import (
     to_body_jacobian,
     world_point,
 )
-from consistency.bench.models import observation
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario import models
+from consistency.bench.scenario.models import Mounting
 from consistency.referee.types import Array
 
 
@@ -45,7 +45,7 @@ def planar_point_width(landmark: PlanarPoint) -> int:
 @implement(to_body, WorldPoint)
 def to_body_of_point(landmark: NamedTuple, frame: Frame, values: Array) -> Triple:
     height = values[2] if len(values) > 2 else 0.0
-    return observation.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], height)
+    return models.turned_to_robot(frame.x, frame.y, frame.c, frame.s, values[0], values[1], height)
 
 
 @implement(to_body_jacobian, PlanarPoint)
@@ -68,7 +68,7 @@ def insert_point(
 ) -> None:
     """By the inverse of eq. 19."""
     c, s, bx, by = frame.c, frame.s, body[0], body[1]
-    values[0], values[1], height = observation.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
+    values[0], values[1], height = models.turned_to_world(frame.x, frame.y, c, s, bx, by, body[2])
     fill_matrix(Jp, 0.0)
     Jp[0, 0] = Jp[1, 1] = 1.0
     Jp[0, 2], Jp[1, 2] = -s * bx - c * by, c * bx - s * by

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from consistency.bench.filters.believed_noise import sensor_noise
-from consistency.bench.models import motion, observation
+from consistency.bench.filters.filter_inputs import sensor_noise
 from consistency.bench.protocols import Problem
-from consistency.bench.scenario import PLANAR_SENSORS, Belief, BelievedSensor
+from consistency.bench.scenario import PLANAR_SENSORS, Belief, BelievedSensor, models
 from consistency.bench.types import Control, Gaussian, Info, Observation
 from consistency.referee.errors import InputError
 from consistency.referee.types import Array, Indices
@@ -34,15 +33,15 @@ class PointSensor:
 
     def measure(self, pose: Array, landmark: Array) -> Array:
         """h: observations (..., 3) of landmarks (..., 3), m, from poses (..., 3)."""
-        body = observation.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
-        x, y, z = observation.to_sensor(*body, self.mount)
-        return np.stack(observation.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
+        body = models.to_robot(*np.moveaxis(pose, -1, 0), *np.moveaxis(landmark, -1, 0))
+        x, y, z = models.to_sensor(*body, self.mount)
+        return np.stack(models.project(x, y, z, self.f, self.B) if self.uvd else (x, y, z), axis=-1)
 
     def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
         """Derivatives of h by the pose (3,) and by the landmark (3,), each (3, 3)."""
-        body = observation.to_robot(*pose, *landmark)
-        c = observation.to_sensor(*body, self.mount)
-        J = np.reshape(observation.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
+        body = models.to_robot(*pose, *landmark)
+        c = models.to_sensor(*body, self.mount)
+        J = np.reshape(models.project_jacobian(*c, self.f, self.B), (3, 3)) if self.uvd else np.eye(3)
         world_to_robot = heading_matrix(pose[2]).T
         d_body = np.column_stack([-world_to_robot[:, 0], -world_to_robot[:, 1], [body[1], -body[0], 0.0]])
         return J @ self.turn.T @ d_body, J @ self.turn.T @ world_to_robot
@@ -52,13 +51,13 @@ class PointSensor:
         c, J = z, np.eye(3)
         if self.uvd:
             u, v, d = z
-            c = np.array(observation.triangulate(u, v, d, self.f, self.B))
-            J = np.reshape(observation.triangulate_jacobian(u, v, d, self.f, self.B), (3, 3))
-        body = observation.from_sensor(c[0], c[1], c[2], self.mount)
+            c = np.array(models.triangulate(u, v, d, self.f, self.B))
+            J = np.reshape(models.triangulate_jacobian(u, v, d, self.f, self.B), (3, 3))
+        body = models.from_sensor(c[0], c[1], c[2], self.mount)
         robot_to_world = heading_matrix(pose[2])
         d_heading = robot_to_world @ [-body[1], body[0], 0.0]
         d_pose = np.column_stack([[1.0, 0, 0], [0, 1.0, 0], d_heading])
-        return np.array(observation.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
+        return np.array(models.to_world(pose[0], pose[1], pose[2], *body)), d_pose, robot_to_world @ self.turn @ J
 
     def less(self, z: Array, about: Array) -> Array:
         return np.asarray(z - about)
@@ -75,13 +74,13 @@ class PlanarSensor:
     def measure(self, pose: Array, landmark: Array) -> Array:
         """h: observations (..., 2) of landmarks (..., 2), m, from poses (..., 3)."""
         x, y, _ = np.moveaxis(self.space.measure(pose, at_height_zero(landmark)), -1, 0)
-        return np.stack(observation.range_bearing(x, y) if self.bearing else (x, y), axis=-1)
+        return np.stack(models.range_bearing(x, y) if self.bearing else (x, y), axis=-1)
 
     def jacobians(self, pose: Array, landmark: Array) -> tuple[Array, Array]:
         """Derivatives of h by the pose (3,) and by the landmark (2,), (2, 3) and (2, 2)."""
         here = at_height_zero(landmark)
         x, y, _ = self.space.measure(pose, here)
-        J = np.reshape(observation.range_bearing_jacobian(x, y), (2, 2)) if self.bearing else np.eye(2)
+        J = np.reshape(models.range_bearing_jacobian(x, y), (2, 2)) if self.bearing else np.eye(2)
         Hp, Hl = self.space.jacobians(pose, here)
         return J @ Hp[:2], J @ Hl[:2, :2]
 
@@ -89,8 +88,8 @@ class PlanarSensor:
         """Landmark (2,) in m from one observation z (2,) at ``pose`` (3,), with Jacobians (2, 3), (2, 2) by both."""
         c, J = z, np.eye(2)
         if self.bearing:
-            c = np.array(observation.at_range_bearing(z[0], z[1]))
-            J = np.reshape(observation.at_range_bearing_jacobian(z[0], z[1]), (2, 2))
+            c = np.array(models.at_range_bearing(z[0], z[1]))
+            J = np.reshape(models.at_range_bearing_jacobian(z[0], z[1]), (2, 2))
         landmark, Jp, Jz = self.space.locate(pose, at_height_zero(c))
         return landmark[:2], Jp[:2], Jz[:2, :2] @ J
 
@@ -158,7 +157,7 @@ def start(problem: Problem, width: int | None = None) -> SlamState:
 
 def pose_after(pose: Array, control: Control) -> Array:
     """Pose (3,) after a step, eq. 18."""
-    return np.array(motion.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
+    return np.array(models.unicycle(pose[0], pose[1], pose[2], control.dt, control.v, control.omega))
 
 
 def motion_jacobians(pose: Array, control: Control) -> tuple[Array, Array]:

@@ -33,7 +33,7 @@ from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import PointSensor, SlamState, heading_matrix, mounted
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
 from consistency.bench.filters.textbook.riekf import additive_from_right
-from consistency.bench.models.observation import Mounting
+from consistency.bench.scenario.models import Mounting
 from consistency.bench.types import Control, Gaussian, Info
 from consistency.referee.types import Array
 

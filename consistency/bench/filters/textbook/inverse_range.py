@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.special import log_ndtr
 from scipy.stats import norm
 
-from consistency.bench.filters.believed_noise import disparity_sigma
+from consistency.bench.filters.filter_inputs import disparity_sigma
 from consistency.bench.filters.textbook.basics import heading_matrix, mounted
 from consistency.bench.scenario.sensor import BelievedSensor
 from consistency.referee.errors import InputError

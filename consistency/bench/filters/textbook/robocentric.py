@@ -50,7 +50,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from consistency.bench.filters.believed_noise import bias_at, variance_at
+from consistency.bench.filters.filter_inputs import bias_at, variance_at
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import heading_matrix
 from consistency.bench.filters.textbook.inverse_range import (

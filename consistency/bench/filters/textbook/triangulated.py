@@ -20,11 +20,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from consistency.bench.filters.believed_noise import disparity_sigma, point_noise, variance_at
+from consistency.bench.filters.filter_inputs import disparity_sigma, point_noise, variance_at
 from consistency.bench.filters.textbook import basics
 from consistency.bench.filters.textbook.basics import SlamState
 from consistency.bench.filters.textbook.ekf import ExtendedKalman
-from consistency.bench.models import observation
+from consistency.bench.scenario import models
 from consistency.bench.types import Info
 from consistency.referee.types import Array
 
@@ -42,7 +42,7 @@ class TriangulatedKalman(ExtendedKalman):
         expected, R = zhat.reshape(-1, 3), R.copy()
         front = expected[:, 0] > 0.0
         x, y, up = expected[front].T
-        pixels = np.column_stack(observation.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
+        pixels = np.column_stack(models.project(x, y, up, sensor.f or 0.0, sensor.B or 0.0))
         R[front] = point_noise(pixels, variance_at(pixels, sensor), sensor)
         bias = np.where(front, self._bias_ratio(state, expected[:, 0]), 0.0)[:, None] * expected
         return basics.corrected(state, H, z.ravel() - zhat - bias.ravel(), R)

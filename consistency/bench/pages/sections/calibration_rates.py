@@ -121,12 +121,14 @@ def calibration_rates() -> tuple[Block, ...]:
     c = calibration()
     if c is None:
         return ()
-    promises = Table(COLUMNS, groups(c), "Promises of the referee, and how often they were kept", style="grouped")
+    promises = Table(
+        COLUMNS, promise_groups(c), "Promises of the referee, and how often they were kept", style="grouped"
+    )
     worlds = Facts(tuple((name, about.replace("`", "")) for name, about in c.worlds.items()), HEADS, "4cm")
     return Text(text(c)), Details("Measured rates", (promises,)), Details("Worlds", (worlds,))
 
 
-def groups(c: Calibration) -> tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]:
+def promise_groups(c: Calibration) -> tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]:
     """What is counted, and for each promise about it, in all its worlds, cells as COLUMNS."""
     promises = []
     for name, about in c.questions.items():

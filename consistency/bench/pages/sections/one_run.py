@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.pages.sections.report_input import Study, Track
+from consistency.bench.scenario.models import dead_reckoning
 from consistency.bench.simulation import simulate
 from consistency.referee.show.blocks import ODOMETRY, SIGMAS, TRUTH, ZERO, Figure, Look, solid
 from consistency.referee.show.figures import add_legend, canvas, curve, dots, edges, make_map, path, say, stroke
@@ -25,6 +25,8 @@ LANDMARK = Look("#8c8c8c", marker="*", size=4.0)
 ALONE = Look(ODOMETRY, (6.0, 3.0), width=1.1)
 TRUE = Look(TRUTH, width=1.6)
 START = Look("#ffffff", size=8.0, edge=TRUTH)
+COMPONENTS = ("x error (m)", "y error (m)", "heading error\n(deg)")
+DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
 
 
 @dataclass(frozen=True)
@@ -38,28 +40,19 @@ class DrawnWorld:
     landmarks: Array | None  # (N, 2)
 
 
-def read(study: Study) -> DrawnWorld:
+def world_of(study: Study) -> DrawnWorld:
     """What the results hold of the shown run."""
+    paths = []
+    for track in study.tracks:
+        path = np.full((len(study.steps), 2), np.nan)
+        step, values = _of_shown_run(study, "estimates", track.name)
+        path[step - 1] = values
+        paths.append((track, path))
+    step, values = _of_shown_run(study, "truth")
+    truth = values[np.argsort(step, kind="stable")] if len(values) else None
     landmarks = study.results.landmarks
-    return DrawnWorld(
-        study,
-        tuple((track, _path(study, track.name)) for track in study.tracks),
-        _truth(study),
-        _odometry(study),
-        None if landmarks is None else landmarks[["x", "y"]].to_numpy(float),
-    )
-
-
-def _path(study: Study, filter_name: str) -> Array:
-    path = np.full((len(study.steps), 2), np.nan)
-    step, values = _of_shown_run(study, "estimates", filter_name)
-    path[step - 1] = values
-    return path
-
-
-def _truth(study: Study) -> Array | None:
-    step, path = _of_shown_run(study, "truth")
-    return path[np.argsort(step, kind="stable")] if len(path) else None
+    places = None if landmarks is None else landmarks[["x", "y"]].to_numpy(float)
+    return DrawnWorld(study, tuple(paths), truth, _odometry(study), places)
 
 
 def _of_shown_run(study: Study, table: str, filter_name: str | None = None) -> tuple[Indices, Array]:
@@ -82,7 +75,7 @@ def _odometry(study: Study) -> Array | None:
 
 def world_map(study: Study) -> tuple[Figure, ...]:
     """Landmarks, and the paths of truth, odometry and filters."""
-    world = read(study)
+    world = world_of(study)
 
     def draw() -> Drawing:
         figure, (axes,) = canvas(2.9)
@@ -114,13 +107,6 @@ def map_caption(world: DrawnWorld) -> str:
     parts.append("estimates in the filters' colours")
     note = "" if world.odometry is not None else " The odometry path is left out: results of a log hold no controls."
     return f"{world.study.name} from above, run {world.study.shown_run}: {', '.join(parts)}.{note}"
-
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
-
-COMPONENTS = ("x error (m)", "y error (m)", "heading error\n(deg)")
-DEGREES = np.array([1.0, 1.0, 180.0 / np.pi])
 
 
 @dataclass(frozen=True)

@@ -134,17 +134,12 @@ def _rule(finding: dict[str, Any], source: str) -> list[Small]:
     below = []
     if finding["accept"]:
         below.append(Small(f"Accepted if: {finding['accept']}", italic=True))
-    run = _run(finding)
+    scenario, run = finding["scenario"], ""
+    if scenario and scenario != "none":
+        run = f"Scenario {scenario}, {finding['runs']} runs, seed {finding['seed']}."
     if source or run:
         below.append(Small(f"{source}. {run}" if source else run))
     return below
-
-
-def _run(finding: dict[str, Any]) -> str:
-    scenario = finding["scenario"]
-    if not scenario or scenario == "none":
-        return ""
-    return f"Scenario {scenario}, {finding['runs']} runs, seed {finding['seed']}."
 
 
 def listing(data: pd.DataFrame, heads: Mapping[str, tuple[str, str]], label: str, caption: str = "") -> Table:
@@ -174,14 +169,12 @@ def single(title: str, caption: str, paint: Callable[[Axes], None]) -> Figure:
     return several(title, caption, (paint,))
 
 
-def several(
-    title: str, caption: str, paints: Sequence[Callable[[Axes], None]], height: float = 1.9, **shared: Any
-) -> Figure:
-    """A figure of panels side by side, each drawn by one of ``paints``; ``shared`` is of :func:`canvas`."""
+def several(title: str, caption: str, paints: Sequence[Callable[[Axes], None]], height: float = 1.9) -> Figure:
+    """A figure of panels side by side, each drawn by one of ``paints``."""
 
     def draw() -> Drawing:
         columns = rows_of(len(paints))
-        figure, panels = canvas(height * -(-len(paints) // columns), columns, len(paints), **shared)
+        figure, panels = canvas(height * -(-len(paints) // columns), columns, len(paints))
         for axes, paint in zip(panels, paints, strict=True):
             paint(axes)
         return add_legend(figure)

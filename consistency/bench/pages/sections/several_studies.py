@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from consistency.bench.pages.sections.anees import anees_curves
+from consistency.bench.pages.sections.nees import anees_curves
 from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
 from consistency.referee.diagnostics.number_words import names_in_a_row, short
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Interval

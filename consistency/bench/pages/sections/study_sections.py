@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from consistency.bench.pages.sections.anees import anees_curves
-from consistency.bench.pages.sections.nees_distribution import nees_distribution
+from consistency.bench.pages.sections.nees import anees_curves, nees_distribution
 from consistency.bench.pages.sections.nis import innovations
 from consistency.bench.pages.sections.one_run import pose_errors, world_map
 from consistency.bench.pages.sections.report_input import Study

@@ -1,4 +1,4 @@
-"""Average NEES of the pose over steps, as Herath et al. (2007) fig. 11."""
+"""NEES of the pose: its average over steps, as Herath et al. (2007) fig. 11, and its distribution in one step."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from consistency.referee.diagnostics.sentences import SPREAD
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import STEP, Scale
 from consistency.referee.diagnostics.whitening import mean_and_count
-from consistency.referee.pages.verdicts import wide
-from consistency.referee.show.blocks import EXPECTED, LIMIT, Figure
-from consistency.referee.show.figures import add_legend, band, canvas, curve, edges, log_axis, stroke
+from consistency.referee.pages.verdicts import Estimator, Judged, wide
+from consistency.referee.show.blocks import EXPECTED, LIMIT, Figure, solid
+from consistency.referee.show.figures import WIDTH, add_legend, band, canvas, curve, edges, log_axis, stroke
 from consistency.referee.types import Array
 
 if TYPE_CHECKING:
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 DIMENSION = "3"  # of a pose: what is expected where no filter has a band
+PANELS = 4  # small ones beside each other
+WINDOW = (-0.02, 1.02)
+OF_DISTRIBUTION = (
+    "Chi-square probability of the NEES in one step of each run, with nothing fitted. "
+    "On the diagonal the covariance is right; a curve below it has too many large values (overconfident), above it "
+    "too many small ones. Shaded: where the whole curve of a right filter lies with probability 95 %."
+)
 
 
 @dataclass(frozen=True)
@@ -61,20 +68,20 @@ class Anees:
         return next((curve for curve in self.curves if not curve.own_band), None)
 
 
-def read(study: Study) -> Anees | None:
+def anees_of(study: Study) -> Anees | None:
     """Curves and bands of the verdicts; None where the truth is not known."""
     if not study.has_truth:
         return None
-    shared = common({track.name: track.verdict for track in study.tracks})
-    return Anees(study, tuple(_curve(t, shared) for t in study.tracks if t.verdict.scale is not None))
-
-
-def _curve(track: Track, shared: Verdict | None) -> Curve:
-    scale, location = track.verdict.scale, track.verdict.location
-    assert scale is not None
-    simultaneous = None if location is None else location.simultaneous
-    others, far = _without_far_runs(track, scale)
-    return Curve(track, scale.anees, scale.band, simultaneous, _fewer(track.verdict, shared), others, far)
+    shared, curves = common({track.name: track.verdict for track in study.tracks}), []
+    for track in study.tracks:
+        scale, location = track.verdict.scale, track.verdict.location
+        if scale is not None:
+            simultaneous = None if location is None else location.simultaneous
+            own_band = _fewer(track.verdict, shared)
+            curves.append(
+                Curve(track, scale.anees, scale.band, simultaneous, own_band, *_without_far_runs(track, scale))
+            )
+    return Anees(study, tuple(curves))
 
 
 def _without_far_runs(track: Track, scale: Scale) -> tuple[Array | None, int]:
@@ -104,7 +111,7 @@ def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
 
 def anees_curves(study: Study) -> tuple[Figure, ...]:
     """The curve of each filter with the band of the study; nothing where the truth is not known."""
-    anees = read(study)
+    anees = anees_of(study)
     if anees is None:
         return ()
     name = f"{study.statistic} of the pose"
@@ -154,9 +161,11 @@ def anees_caption(anees: Anees) -> str:
         if own
         else ""
     )
+    own_errors = names_in_a_row(study.own_errors)
+    error = f" In the filter's own error: {own_errors}." if own_errors else ""
     return (
         f"{what}; {expected} is expected (line). Shaded: 95 % of single steps of a right filter (eq. 17); for "
-        f"orientation only.{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{_own(anees)}"
+        f"orientation only.{_simultaneous(anees)} Above is overconfident, below conservative.{extra}{error}"
         f"{''.join(map(_told, anees.curves))}"
     )
 
@@ -174,12 +183,6 @@ def _told(curve_of: Curve) -> str:
     )
 
 
-def _own(anees: Anees) -> str:
-    """Whose NEES is that of another error than the additive one."""
-    own = anees.study.own_errors
-    return f" In the filter's own error: {names_in_a_row(own)}." if own else ""
-
-
 def _simultaneous(anees: Anees) -> str:
     """What the dashed band is, where a filter was asked about single steps."""
     if anees.common is None:
@@ -194,3 +197,53 @@ def _simultaneous(anees: Anees) -> str:
         f"probability at most {100 * shares[0] * track.verdict.settings.false_alarm:.2g} %, its share of the verdict's "
         f"false-alarm rate{others if len(anees.study.tracks) > 1 else ''}."
     )
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Empirical distribution function of chi-square's distribution function at N values of the NEES."""
+
+    track: Estimator
+    x: Array  # (N + 2,), with 0 and 1
+    y: Array  # (N + 2,)
+    half_width: float  # of the simultaneous band
+
+
+def steps(track: Estimator) -> Steps | None:
+    """Distribution of one filter; None without NEES."""
+    tails = track.verdict.tails
+    if tails is None or not len(tails.pit) or not np.isfinite(tails.half_width):
+        return None
+    height = np.arange(1, len(tails.pit) + 1) / len(tails.pit)
+    x, y = (np.concatenate([[0.0], column, [1.0]]) for column in (tails.pit, height))
+    return Steps(track, x, y, tails.half_width)
+
+
+def nees_distribution(study: Judged) -> tuple[Figure, ...]:
+    """A small panel for each filter that has a NEES."""
+    filters = [of for track in study.tracks if (of := steps(track)) is not None]
+    if not filters:
+        return ()
+
+    def draw() -> Drawing:
+        rows, columns = -(-len(filters) // PANELS), min(len(filters), PANELS)
+        # panels that are nearly square
+        figure, panels = canvas(1.45 * rows, columns, len(filters), width=WIDTH * columns / PANELS + 0.2, sharey=True)
+        for axes, of in zip(panels, filters, strict=True):
+            _draw_steps(axes, of)
+        for axes in panels[::PANELS]:
+            axes.set_ylabel("share of runs")
+        return add_legend(figure)
+
+    return (Figure("Distribution of the NEES", OF_DISTRIBUTION, (draw,), level=4),)
+
+
+def _draw_steps(axes: Axes, of: Steps) -> None:
+    corners = np.unique([0.0, of.half_width, 1.0 - of.half_width, 1.0])
+    ends = np.clip(corners[:, None] + [-of.half_width, of.half_width], 0.0, 1.0)
+    band(axes, corners, ends, "95 % band of the whole curve")
+    axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
+    look = replace(solid(of.track.look), width=1.3)
+    curve(axes, of.x, of.y, look, "", of.track.tag, drawstyle="steps-post")
+    ticks = (0.0, 0.5, 1.0)
+    axes.set(xlabel="chi-square cdf", title=of.track.name, xlim=WINDOW, ylim=WINDOW, xticks=ticks, yticks=ticks)

@@ -1,4 +1,7 @@
-"""The simulated world: paths, truth, controls and observations from a scenario and random generators."""
+"""The simulated world: paths, truth, controls and observations from a scenario and random generators.
+
+Nothing here imports a filter.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from consistency.bench.models import motion
-from consistency.bench.models.motion import dead_reckoning
 from consistency.bench.scenario import (
     AnnularLandmarks,
     Circle,
@@ -27,6 +28,7 @@ from consistency.bench.scenario import (
     UvdSensor,
     Waypoints,
     load_scenario,
+    models,
 )
 from consistency.bench.scenario.effects import (
     Context,
@@ -138,7 +140,7 @@ class World:
         self.landmarks = draw_landmarks(truth)
         self.start = start_pose(truth)
         self.planned = planned_controls(truth)
-        self.reference = motion.dead_reckoning(self.start, self.planned)
+        self.reference = models.dead_reckoning(self.start, self.planned)
         self.linear = truth.sensor.model == "linear"
         # noise on the odometry leaves the path as planned, and a linear world looks from it
         self.undisturbed = not self.linear and truth.motion.noise_on != "motion"
@@ -191,7 +193,7 @@ class World:
             return _drive_linear(self.reference, planned, noise), planned
         if self.undisturbed:
             return self.reference, planned - noise
-        return motion.dead_reckoning(self.start, planned + noise), planned
+        return models.dead_reckoning(self.start, planned + noise), planned
 
 
 def simulate(scenario: Scenario | str | Path, run: int = 0, seed: int = 0) -> Trial:
@@ -258,7 +260,7 @@ def _drive_linear(reference: Array, planned: Array, noise: Array) -> Array:
     along = dt * v_noise
     path = reference.copy()
     for axis, slope, share in zip(
-        (0, 1), motion.unicycle_jacobian(heading, dt, v), (np.cos(heading), np.sin(heading)), strict=True
+        (0, 1), models.unicycle_jacobian(heading, dt, v), (np.cos(heading), np.sin(heading)), strict=True
     ):
         path[1:, axis] += np.cumsum(np.column_stack([slope * pose_before, along * share]))[1::2]
     path[1:, 2] += turned
@@ -297,7 +299,7 @@ def start_pose(truth: Truth) -> Array:
 
 def planned_path(truth: Truth) -> Array:
     """Poses 0..steps of the path without any noise, shape (steps + 1, 3)."""
-    return dead_reckoning(start_pose(truth), planned_controls(truth))
+    return models.dead_reckoning(start_pose(truth), planned_controls(truth))
 
 
 def lap_length(path: Path_) -> float:

@@ -99,6 +99,13 @@ def test_records_are_paired_where_that_is_declared(tmp_path):
         cs.compare(a, b, false_alarm=2.0)
 
 
+def test_first_steps_of_files_are_left_out_as_those_of_records(tmp_path):
+    a, b = (archive(tmp_path / f"{name}.npz", errors(1, s)) for name, s in (("a", 1.0), ("b", 1.5)))
+    later = cs.compare(b, a, skip=2).comparison.p_value
+    assert later == cs.compare(cs.read(b), cs.read(a), skip=2).comparison.p_value
+    assert later != cs.compare(b, a).comparison.p_value
+
+
 def test_verdicts_are_rows_of_a_table():
     good = cs.judge(errors(1), P, name="good")
     bad = cs.judge(errors(1, 2.0), P, name="bad")

@@ -114,6 +114,12 @@ def test_the_interval_of_the_factor_holds_what_no_test_rejects():
     assert_allclose(Exceedance(np.zeros((100, 1)), np.zeros(100, int), 0.95).rate_limit(), 1 - 0.05**0.01, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("level", "factor"), [(0.75, 150.0), (0.95, 190.0)])
+def test_the_factor_is_the_smallest_size_with_no_more_than_its_share_outside(level, factor):
+    of = Exceedance(np.arange(1.0, 201.0)[:, None], np.zeros(200, int), level)
+    assert of.factor().value == factor
+
+
 def test_a_bound_of_zero_has_no_factor():
     sizes = Exceedance(np.full((100, 3), np.inf), np.zeros(100, int), 0.95)
     assert sizes.factor() == (np.inf, np.inf, np.inf)

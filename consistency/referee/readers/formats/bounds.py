@@ -341,7 +341,7 @@ def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
 def regions_of(stated: Bounds, values: Array, errors: Array) -> Array | None:
     """Regions of the Stanford diagram of errors (N, n) with bounds (N, bounds, 2), by their places in REGIONS.
 
-    (N, bounds), NaN of a bound without an alert limit; None where no bound has one. Of an interval its longer side
+    (N, bounds), which say nothing of a bound without an alert limit; None where no bound has one. Of an interval its longer side
     decides whether it alerts.
     """
     limits = np.array([np.nan if bound.alert_limit is None else bound.alert_limit for bound in stated.bounds])
@@ -351,7 +351,7 @@ def regions_of(stated: Bounds, values: Array, errors: Array) -> Array | None:
     is_misleading = ratios > 1.0
     is_hazard = np.abs(_bounded_errors(stated, errors)) > limits
     regions = np.where(values.max(axis=-1) > limits, 3.0 + is_misleading, np.where(is_hazard, HAZARD, is_misleading))
-    return np.where(np.isnan(ratios + limits), np.nan, regions)
+    return np.where(np.isnan(ratios), np.nan, regions)
 
 
 def _bounded_errors(stated: Bounds, errors: Array) -> Array:

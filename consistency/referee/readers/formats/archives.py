@@ -13,14 +13,7 @@ from typing import Any
 import numpy as np
 
 from consistency.referee.diagnostics.groups import on_steps
-from consistency.referee.diagnostics.record import (
-    Errors,
-    InnovationRecord,
-    Record,
-    Runs,
-    TruthFit,
-    numbered_axes,
-)
+from consistency.referee.diagnostics.record import Errors, InnovationRecord, Record, Runs, TruthFit, numbered_axes
 from consistency.referee.errors import InputError
 from consistency.referee.geometry import INERTIAL, PLANAR, state_error
 from consistency.referee.parsing import is_file, reading, require_name, require_room
@@ -132,8 +125,7 @@ def estimator_of_arrays(path: Path, arrays: Mapping[str, Array], r: Reading) -> 
         states = archive.array("estimates", 3)
         arrays = {**arrays, "truth": np.nan_to_num(np.broadcast_to(first_known(states), states.shape))}
         archive = Archive(path, arrays)
-    if kind != OF_NEES:
-        require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
+    require_layout(kind[0], arrays[kind[0]].shape, arrays["covariances"].shape, f"{path}: ")
     if kind == OF_ERRORS:
         truth = archive.array("errors", 3)
         estimates = np.where(np.isfinite(truth), 0.0, np.nan)

@@ -250,7 +250,7 @@ def _own_column(own: Lines, options: GroupOptions) -> Array | None:
     """
     by = options.own_column
     if by == "t" and "t" not in own.columns:
-        return own.t - own.t[0]
+        return np.asarray(own.t - own.t[0])
     if by is None or not own.columns:
         return None
     if by not in own.columns:

@@ -341,8 +341,8 @@ def ratios_of(stated: Bounds, values: Array, errors: Array) -> Array:
 def regions_of(stated: Bounds, values: Array, errors: Array) -> Array | None:
     """Regions of the Stanford diagram of errors (N, n) with bounds (N, bounds, 2), by their places in REGIONS.
 
-    (N, bounds), which say nothing of a bound without an alert limit; None where no bound has one. Of an interval its longer side
-    decides whether it alerts.
+    (N, bounds), which say nothing of a bound without an alert limit; None where no bound has one. Of an interval its
+    longer side decides whether it alerts.
     """
     limits = np.array([np.nan if bound.alert_limit is None else bound.alert_limit for bound in stated.bounds])
     if np.isnan(limits).all():

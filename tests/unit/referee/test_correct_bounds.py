@@ -196,6 +196,13 @@ def test_rows_and_archives_are_not_told_apart_in_a_file(tmp_path, capsys):
     (factor,) = tomllib.loads((tmp_path / "c/correction.toml").read_text())["factors"]
     bound = np.loadtxt(tmp_path / "c/corrected/est.csv", delimiter=",", skiprows=1)[:, 3]
     np.testing.assert_allclose(bound, factor["factor"])
+    of_runs = tmp_path / "runs.csv"
+    of_runs.write_text(
+        "\n".join(["run,t,x,true_x,bound_x", *(f"{k % 4},{k},{k % 5 - 2},0,1.0" for k in range(80))]) + "\n"
+    )
+    out, _ = consistency(capsys, "correct", of_runs, *words[2:], tmp_path / "r")
+    assert "corrected/runs.csv" in out
+    assert "held-out/" not in out
     (tmp_path / "by.csv").write_text("t,light\n" + "\n".join(f"{k},{'ab'[k % 2]}" for k in range(80)) + "\n")
     by = ("--by", "light", "--by-file", tmp_path / "by.csv")
     assert "corrected/est.csv" not in consistency(capsys, *words, tmp_path / "d", *by)[0]

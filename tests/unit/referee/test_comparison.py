@@ -469,7 +469,7 @@ def members_table(path, m, ratio=1.0, seed=0, runs=40):
     truth, draws = members(np.random.default_rng(seed), m, ratio, runs)
     rows = [",".join(["run", "step", "true_x", *(f"ex{i}" for i in range(m))])]
     for run, step in np.ndindex(truth.shape[:2]):
-        rows.append(",".join(map(str, [run, step, truth[run, step, 0], *draws[run, step, :, 0]])))
+        rows.append(",".join(map(str, [run + 3, step, truth[run, step, 0], *draws[run, step, :, 0]])))
     path.write_text("\n".join(rows) + "\n")
     return path
 
@@ -484,7 +484,9 @@ def test_members_are_compared_as_numbers_of_one_kind(tmp_path, capsys):
     assert found["worse"]
     assert [d["name"] for d in found["differences"]] == ["ANEES"]  # their RMSE has no unit
     kind = found["sentence"].partition("Both are ")[2]
-    shown = summary_of(cs.read(a, members={"x": "ex*"})).kind
+    summary_of_a = summary_of(cs.read(a, members={"x": "ex*"}))
+    assert summary_of_a.runs.tolist() == list(range(3, 43))
+    shown = summary_of_a.kind
     assert kind == shown
     assert "numbers of 20 members" in kind
     assert float(kind.split()[-1]) == pytest.approx(1.55, abs=0.25)  # of 2, less

@@ -475,11 +475,17 @@ def _figures(found: Correction) -> Table:
 
 
 def correction_lines(found: Correction) -> Iterator[str]:
-    """Gain of the log score, what `analyse` says of the held-out files, and limits."""
+    """Gain of the log score, what the uncertainty of the factors does, and limits."""
     gain = found.gain
     ends = f" [{gain.low:.3g}, {gain.high:.3g}]" if np.isfinite(gain.low) else ""
     if not found.assumed:
         yield f"log score gained a step, on average over {found.unit}s: {gain.value:.3g}{ends}"
+    if len(found.fitted) < FEW and np.isfinite(found.excess) and f"{found.excess:.3g}" != "1":
+        without = found.after.ratio.value / found.excess
+        yield (
+            f"factors of {plural(len(found.fitted), found.unit)} are uncertain, which adds x{found.excess:.3g} to a "
+            f"held-out ratio; without it the ratio is {short(without)}"
+        )
     if found.verdict.status != found.after.verdict.status:
         yield (
             f"analyse says of held-out/: {found.after.verdict.reasons[0]}; it takes the factors for exact, while here "

@@ -281,7 +281,7 @@ def test_looks_need_whole_covariances(place, capsys):
     script(place, 'cut -d, -f1-8,11,13 "$CONSISTENCY_HERE/tables/$1.csv" > estimates.csv')  # variances alone
     words = ("--overwrite", "--out", "out", "--", "./filter", "{run}")
     status, _, err = monte_carlo("--until-decided", *words, capsys=capsys)
-    assert (status, "--until-decided: ./filter has components" in err) == (2, True)
+    assert (status, "--until-decided: ./filter has bounds, members, components" in err) == (2, True)
     assert monte_carlo("--runs", "12", *words, capsys=capsys)[0] == 0
 
 

@@ -25,14 +25,14 @@ def full(name="f"):
     """A record with each array that it can have."""
     return Record(
         name,
-        Errors(numbered(2), numbered(2, 2), numbered(), 2, ("x", "y"), bound_ratios=numbered(2)),
+        Errors(numbered(2), numbered(2, 2), numbered(), 2, ("x", "y"), bound_ratios=numbered(2), regions=numbered(2)),
         InnovationRecord(numbered(), numbered(), numbered(3), numbered(3, 3)),
         Runs(np.arange(10, 15), times=numbered(), by=numbered()),
         (Failure(name, 11, 2, "broke"), Failure(name, 14, 3, "hung")),
         Truth(numbered(2, 2)),
         groups=Groups("speed", ("low",), numbered().astype(int), None),
         origin=Origin(path=numbered(2, 2)),
-        world=Errors(numbered(2), numbered(2, 2), numbered(), bound_ratios=numbered(2)),
+        world=Errors(numbered(2), numbered(2, 2), numbered(), bound_ratios=numbered(2), regions=numbered(2)),
     )
 
 
@@ -53,7 +53,7 @@ def test_some_runs_have_the_rows_of_every_array():
         assert [failure.run for failure in some.failures] == [11]
         assert_array_equal(some.groups.index[:, 0], [1, 3])
         arrays = arrays_of(some) | {f"world.{name}": getattr(some.world, name) for name in Errors.OF_RUNS}
-        assert len(arrays) == 17
+        assert len(arrays) == 19
         for name, array in arrays.items():
             if name != "runs.numbers":
                 assert_array_equal(array.reshape(2, -1)[:, 0], [1, 3], name)

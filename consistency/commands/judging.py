@@ -499,7 +499,7 @@ def monitor_command(
         as_json,
     )
     if plot is not None:
-        from consistency.referee.pages.record_figures import monitor_drawing
+        from consistency.referee.pages.ratio_figures import monitor_drawing
 
         plotted(partial(monitor_drawing, watched), plot)
     if fail_on and watched.alarm is not None:
@@ -520,6 +520,6 @@ def _show_ratios(
     tell(notes)
     print_document(ratios_document(path.stem, ratios), as_json)
     if plot is not None:
-        from consistency.referee.pages.record_figures import monitor_drawing
+        from consistency.referee.pages.ratio_figures import monitor_drawing
 
         plotted(partial(monitor_drawing, ratios), plot)

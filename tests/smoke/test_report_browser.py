@@ -19,7 +19,7 @@ import consistency as cs
 from consistency.bench.pages import write_reports
 from consistency.commands import main
 from consistency.referee.diagnostics.verdict_parts import STATUSES
-from consistency.referee.pages.record_figures import monitor_drawing
+from consistency.referee.pages.ratio_figures import monitor_drawing
 from consistency.referee.pages.verdicts import MARKS
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show import as_html

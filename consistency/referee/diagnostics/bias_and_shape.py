@@ -14,12 +14,14 @@ from scipy import special
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import distributions
 from consistency.referee.diagnostics.distributions import weighted_chi_square_tail
+from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.scale import UNKNOWN, RunMeans, ratio_interval
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.diagnostics.whitening import all_finite, are_unlike, block_slices, by_runs, standardise
 from consistency.referee.types import Array, Indices
 
 FEWEST = 6  # runs that determine the size of an axis in a step
+MOST_AXES = 12  # components whose coverage is shown
 ALL_AT_ONCE = 3  # numbers, of which the test of Hotelling keeps its rate with heavy tails
 
 
@@ -322,3 +324,27 @@ def largest_direction(whitened: Array) -> Largest:
 
 def _leading(moments: Array) -> Array:
     return np.asarray(np.linalg.eigh(moments.mean(axis=0))[1][:, -1])
+
+
+def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
+    """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
+
+    Of all steps of all runs, and of ``MOST_AXES`` components at most; -> (N,) each.
+    """
+    found: dict[str, Array] = {}
+    if record.errors.error is not None and record.errors.covariance is not None:
+        sigma = np.sqrt(np.diagonal(record.errors.covariance, axis1=-2, axis2=-1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            z = np.abs(record.errors.error) / sigma
+        for i, name in enumerate(record.errors.names[:MOST_AXES]):
+            found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
+    if record.errors.nees is not None and record.errors.dof and not record.errors.parts:
+        found["all together"] = _shares(record.errors.nees, distributions.chi2.ppf(p, record.errors.dof))
+    return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
+
+
+def _shares(values: Array, limits: Array) -> Array:
+    known = np.sort(values[np.isfinite(values)])
+    if not len(known):
+        return np.full(len(limits), np.nan)
+    return np.searchsorted(known, limits, side="right") / len(known)

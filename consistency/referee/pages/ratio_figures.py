@@ -1,29 +1,56 @@
-"""Covariance ratio, bias and coverage by axis of the pose, and the ratio by groups of runs and steps."""
+"""Ratios as figures: of the axes of the pose, of groups of runs and steps, and of a monitor over time.
+
+Beside the covariance ratio of an axis stand its bias and its coverage; a monitor's ratios are NIS over their degrees of
+freedom, or the test ratios of a sensor.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from consistency.referee.diagnostics.monitor import GateRatios
 from consistency.referee.diagnostics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.number_words import UNCERTAIN
 from consistency.referee.diagnostics.verdict import Verdict
-from consistency.referee.pages.verdicts import Judged
-from consistency.referee.show.blocks import EXPECTED, Block, Cell, Column, Details, Figure, Quantity, solid, table
-from consistency.referee.show.figures import add_legend, canvas, dodge, dots, intervals, log_axis, name_rows, stroke
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Drawing
-
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 from consistency.referee.diagnostics.verdict_parts import SIDES, ByGroup, Group
-from consistency.referee.show.blocks import ACCEPTED, BAND, LOW, REJECTED, Look
+from consistency.referee.pages.verdicts import Judged
+from consistency.referee.show.blocks import (
+    ACCEPTED,
+    BAND,
+    EXPECTED,
+    LIMIT,
+    LOW,
+    OVER,
+    REJECTED,
+    Block,
+    Cell,
+    Column,
+    Details,
+    Figure,
+    Look,
+    Quantity,
+    solid,
+    style,
+    table,
+)
+from consistency.referee.show.figures import (
+    add_legend,
+    canvas,
+    curve,
+    dodge,
+    dots,
+    intervals,
+    log_axis,
+    name_rows,
+    points,
+    stroke,
+)
+from consistency.referee.types import Array
+from consistency.referee.verdicts.monitor_sources import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +61,12 @@ Row = tuple[str, tuple[Interval | None, ...]]  # an axis, and an interval or Non
 
 WHOLE, DIRECTION = "all axes", "worst direction"
 FAR = 30.0  # an interval that reaches further than this factor beyond all values is cut off
+HEIGHT = 3.6  # inches
+FROM_START = "time from the start (s)"
+LONG = 2000  # test ratios drawn of a sensor
+POINTS = 600  # at most, of the NIS: few enough to see a change among them
+EACH_STEP = replace(style(0), size=1.8, alpha=0.7)
+FAULT = Look(OVER, width=1.1)
 
 
 @dataclass(frozen=True)
@@ -286,3 +319,81 @@ def bound_figures(verdict: Verdict) -> tuple[Figure, ...]:
         "with its 95 % interval; 1 is right (line), above is overconfident; log axis."
     )
     return (Figure("Coverage of the bounds", caption, (draw,)),)
+
+
+# --- a monitor -------------------------------------------------------------------------------------------
+
+
+def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
+    """NIS / dof above, the e-value below, over time, or the steps of a file without; or test ratios of each sensor."""
+    if isinstance(shown, Watched):
+        figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
+        _draw_sizes(above, shown)
+        _draw_evidence(below, shown)
+        return add_legend(figure)
+    figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
+    start = min((float(each.t[0]) for each in shown if len(each.t)), default=0.0)
+    for axes, each in zip(panels, shown, strict=True):
+        _draw_ratios(axes, each, start)
+    panels[-1].set_xlabel(FROM_START)
+    return add_legend(figure)
+
+
+def _draw_ratios(axes: Axes, each: GateRatios, start: float) -> None:
+    """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
+    points(axes, each.t - start, each.ratio, EACH_STEP, "test ratio", limit=LONG)
+    for at, look, label in ((1.0, LIMIT, "gate"), (each.unusual, EXPECTED, "rarely exceeded by a right filter")):
+        if np.isfinite(at):
+            axes.axhline(at, **stroke(look), label=label)
+    axes.set(ylabel="test ratio", title=each.sensor)
+
+
+def _draw_sizes(axes: Axes, watched: Watched) -> None:
+    """NIS over its degrees of freedom."""
+    step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
+    points(axes, step, ratio, EACH_STEP, "NIS / dof", limit=POINTS)
+    axes.axhline(1.0, **stroke(EXPECTED), label="expected")
+    axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
+    if (ratio > 0).any():
+        log_axis(axes, "y")
+
+
+def _draw_evidence(axes: Axes, watched: Watched) -> None:
+    """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
+
+    What continues beyond the square of that value is cut off.
+    """
+    threshold, alarm = watched.monitor.threshold, watched.alarm
+    clock, label = _clock(watched)
+    if alarm is not None:
+        since, raised = float(alarm.since), float(alarm.step)
+        if label != "step":
+            since, raised = watched.since_t - watched.t[0], watched.alarm_t - watched.t[0]
+        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0, label="since the fault")
+        axes.axvline(raised, **stroke(FAULT), label="alarm")
+    axes.axhline(threshold, **stroke(LIMIT), label="e-value of an alarm")
+    evidence = np.minimum(watched.evidence, threshold**3)  # it may be near the largest number that there is
+    curve(axes, clock, evidence, style(0), "e-value")
+    axes.set(xlabel=label, ylabel="e-value")
+    log_axis(axes, "y")
+    low, high = evidence[evidence > 0.0].min(initial=1.0), evidence.max(initial=threshold)
+    axes.set_ylim(low / 2.0, min(2.0 * high, threshold**2))
+
+
+def _clock(watched: Watched) -> tuple[Array, str]:
+    """Times of the steps from the first on, s, or their numbers where some have none; and what they are."""
+    if len(watched.t) and np.isfinite(watched.t).all():
+        return watched.t - watched.t[0], FROM_START
+    return watched.step, "step"
+
+
+def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:
+    """Steps and ratios (N,) averaged over as many neighbours as leave few enough points; how many those are."""
+    known = np.isfinite(ratio)
+    step, ratio = step[known], ratio[known]
+    together = max(1, -(-len(ratio) // POINTS))
+    starts = np.arange(0, len(ratio), together)
+    if together == 1:
+        return step, ratio, 1
+    counts = np.diff(np.append(starts, len(ratio)))
+    return np.add.reduceat(step, starts) / counts, np.add.reduceat(ratio, starts) / counts, together

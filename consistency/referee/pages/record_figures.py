@@ -1,6 +1,6 @@
 """Figures of one estimator: errors with their bounds, NEES, trajectory, coverage, innovations.
 
-What a monitor found is drawn over time. Where runs have one step, as those of a factor or a calibration, the runs
+Where runs have one step, as those of a factor or a calibration, the runs
 stand along the axis, each a point.
 """
 
@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from consistency.referee.diagnostics import distributions
-from consistency.referee.diagnostics.monitor import GateRatios
+from consistency.referee.diagnostics.bias_and_shape import observed_coverage
+from consistency.referee.diagnostics.normal_numbers import rank_shares
 from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.uncertain_truth import of_both
@@ -27,7 +27,6 @@ from consistency.referee.show.blocks import (
     BAND,
     EXPECTED,
     LIMIT,
-    OVER,
     SIGMAS,
     TRUTH,
     ZERO,
@@ -52,7 +51,6 @@ from consistency.referee.show.figures import (
     with_small_ones,
 )
 from consistency.referee.types import Array, Indices
-from consistency.referee.verdicts.monitor_sources import Watched
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +58,6 @@ if TYPE_CHECKING:
 
 STACK = 3  # panels one below the other
 MOST_PANELS = 12  # components of an error that are drawn
-MOST_RANKS = 21  # that are drawn
 SPREADS = 10  # groups of steps by the spread of the members
 MOST_RUNS = 20  # runs that are drawn beside the shown one
 ANGLES = {"heading", "yaw", "pitch", "roll"}
@@ -83,12 +80,6 @@ SHARE = 0.95  # of a right estimator's errors in a step that lie inside its elli
 CORNERS = 73
 TRUE, ESTIMATED = Look(TRUTH, width=0.9), replace(style(0), width=1.0)
 ELLIPSE, AT = replace(style(0), width=1.2), Look(TRUTH, marker="X", size=4.0)
-HEIGHT = 3.6  # inches
-FROM_START = "time from the start (s)"
-LONG = 2000  # test ratios drawn of a sensor
-POINTS = 600  # at most, of the NIS: few enough to see a change among them
-EACH_STEP = replace(style(0), size=1.8, alpha=0.7)
-FAULT = Look(OVER, width=1.1)
 
 
 @dataclass(frozen=True)
@@ -477,51 +468,6 @@ def _single_nees(record: Record) -> Picture | None:
 # --- coverage ---------------------------------------------------------------------------------------
 
 
-def observed_coverage(record: Record, p: Array) -> dict[str, Array]:
-    """Share of errors inside the interval that should hold them with probability ``p`` (N,), by component and jointly.
-
-    Of all steps of all runs; -> (N,) each.
-    """
-    found: dict[str, Array] = {}
-    if record.errors.error is not None and record.errors.covariance is not None:
-        sigma = np.sqrt(np.diagonal(record.errors.covariance, axis1=-2, axis2=-1))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.abs(record.errors.error) / sigma
-        for i, name in enumerate(record.errors.names[:MOST_PANELS]):
-            found[name] = _shares(z[..., i], np.sqrt(2.0) * special.erfinv(p))
-    if record.errors.nees is not None and record.errors.dof and not record.errors.parts:
-        found["all together"] = _shares(record.errors.nees, distributions.chi2.ppf(p, record.errors.dof))
-    return {name: shares for name, shares in found.items() if np.isfinite(shares).any()}
-
-
-def _shares(values: Array, limits: Array) -> Array:
-    known = np.sort(values[np.isfinite(values)])
-    if not len(known):
-        return np.full(len(limits), np.nan)
-    return np.searchsorted(known, limits, side="right") / len(known)
-
-
-def rank_shares(record: Record) -> tuple[dict[str, Array], float]:
-    """Shares of truths in each rank among the members, by component, (k,), and by how much all lie near 1 / k.
-
-    The half-width of the band holds in all ranks with 95 %, by the spread between runs, which are independent.
-    """
-    if record.errors.ensemble is None or record.errors.error is None:
-        return {}, float("nan")
-    ranks = min(record.errors.ensemble.members + 1, MOST_RANKS)
-    names = list(record.errors.names or range(record.errors.error.shape[-1]))[: record.errors.ensemble.spread.shape[1]]
-    shares = {}
-    widths = []
-    for i, name in enumerate(names):
-        place = np.floor(special.ndtr(record.errors.error[..., i]) * ranks).clip(max=ranks - 1)
-        inside = place[..., None] == np.arange(ranks)
-        counts, size = inside.sum(axis=1), np.isfinite(place).sum()
-        shares[str(name)] = counts.sum(axis=0) / max(size, 1)
-        apart = counts - np.isfinite(place).sum(axis=1)[:, None] / ranks
-        widths.append(np.sqrt(np.square(apart).sum(axis=0).mean()) / max(size, 1))
-    return shares, float(-special.ndtri(0.025 / ranks) * np.mean(widths))
-
-
 def _ranks(record: Record) -> Picture | None:
     """Histogram of the rank of the truth among the members."""
     shares, width = rank_shares(record)
@@ -737,78 +683,3 @@ def _worst(record: Record, row: int) -> Indices:
         if all(abs(int(step) - other) >= apart for other in found):
             found.append(int(step))
     return np.array(found, np.int64)
-
-
-def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
-    """NIS / dof above, the e-value below, over time, or the steps of a file without; or test ratios of each sensor."""
-    if isinstance(shown, Watched):
-        figure, (above, below) = canvas(HEIGHT, panels=2, sharex=True)
-        _draw_sizes(above, shown)
-        _draw_evidence(below, shown)
-        return add_legend(figure)
-    figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
-    start = min((float(each.t[0]) for each in shown if len(each.t)), default=0.0)
-    for axes, each in zip(panels, shown, strict=True):
-        _draw_ratios(axes, each, start)
-    panels[-1].set_xlabel(FROM_START)
-    return add_legend(figure)
-
-
-def _draw_ratios(axes: Axes, each: GateRatios, start: float) -> None:
-    """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
-    points(axes, each.t - start, each.ratio, EACH_STEP, "test ratio", limit=LONG)
-    for at, look, label in ((1.0, LIMIT, "gate"), (each.unusual, EXPECTED, "rarely exceeded by a right filter")):
-        if np.isfinite(at):
-            axes.axhline(at, **stroke(look), label=label)
-    axes.set(ylabel="test ratio", title=each.sensor)
-
-
-def _draw_sizes(axes: Axes, watched: Watched) -> None:
-    """NIS over its degrees of freedom."""
-    step, ratio, together = averaged(_clock(watched)[0], watched.nis_over_dof)
-    points(axes, step, ratio, EACH_STEP, "NIS / dof", limit=POINTS)
-    axes.axhline(1.0, **stroke(EXPECTED), label="expected")
-    axes.set(ylabel="NIS / dof" if together == 1 else f"NIS / dof\n(mean of {together})", title=watched.name)
-    if (ratio > 0).any():
-        log_axis(axes, "y")
-
-
-def _draw_evidence(axes: Axes, watched: Watched) -> None:
-    """E-value after each step with the value at which an alarm is raised; since the fault it is shaded.
-
-    What continues beyond the square of that value is cut off.
-    """
-    threshold, alarm = watched.monitor.threshold, watched.alarm
-    clock, label = _clock(watched)
-    if alarm is not None:
-        since, raised = float(alarm.since), float(alarm.step)
-        if label != "step":
-            since, raised = watched.since_t - watched.t[0], watched.alarm_t - watched.t[0]
-        axes.axvspan(since, raised, color=FAULT.colour, alpha=0.15, linewidth=0, label="since the fault")
-        axes.axvline(raised, **stroke(FAULT), label="alarm")
-    axes.axhline(threshold, **stroke(LIMIT), label="e-value of an alarm")
-    evidence = np.minimum(watched.evidence, threshold**3)  # it may be near the largest number that there is
-    curve(axes, clock, evidence, style(0), "e-value")
-    axes.set(xlabel=label, ylabel="e-value")
-    log_axis(axes, "y")
-    low, high = evidence[evidence > 0.0].min(initial=1.0), evidence.max(initial=threshold)
-    axes.set_ylim(low / 2.0, min(2.0 * high, threshold**2))
-
-
-def _clock(watched: Watched) -> tuple[Array, str]:
-    """Times of the steps from the first on, s, or their numbers where some have none; and what they are."""
-    if len(watched.t) and np.isfinite(watched.t).all():
-        return watched.t - watched.t[0], FROM_START
-    return watched.step, "step"
-
-
-def averaged(step: Array, ratio: Array) -> tuple[Array, Array, int]:
-    """Steps and ratios (N,) averaged over as many neighbours as leave few enough points; how many those are."""
-    known = np.isfinite(ratio)
-    step, ratio = step[known], ratio[known]
-    together = max(1, -(-len(ratio) // POINTS))
-    starts = np.arange(0, len(ratio), together)
-    if together == 1:
-        return step, ratio, 1
-    counts = np.diff(np.append(starts, len(ratio)))
-    return np.add.reduceat(step, starts) / counts, np.add.reduceat(ratio, starts) / counts, together

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import consistency as cs
 from consistency.bench.runs.results_to_records import innovations_of
 from consistency.referee.errors import InputError
-from consistency.referee.pages.record_figures import POINTS, averaged, monitor_drawing
+from consistency.referee.pages.ratio_figures import POINTS, averaged, monitor_drawing
 from consistency.referee.pages.write_pages import plotted, require_plot
 from consistency.referee.readers.formats.innovation_files import NisLog
 from consistency.referee.show.as_json import render

@@ -12,13 +12,14 @@ from consistency.errors import InputError
 from consistency.referee.diagnostics.normal_numbers import (
     TOGETHER,
     rank_numbers,
+    rank_shares,
     rank_tables,
     step_down_numbers,
     step_down_tables,
 )
 from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.gating.checked_input import planned_detect
-from consistency.referee.pages.record_figures import rank_shares, record_figures
+from consistency.referee.pages.record_figures import record_figures
 from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.read_files import read_recordings
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent

@@ -16,7 +16,8 @@ from records import changed
 from scipy import stats
 
 import consistency as cs
-from consistency.referee.pages.record_figures import observed_coverage, record_figures, shown_run, unit_of
+from consistency.referee.diagnostics.bias_and_shape import observed_coverage
+from consistency.referee.pages.record_figures import record_figures, shown_run, unit_of
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.pages.write_pages import compose_files
 from consistency.referee.show import as_html

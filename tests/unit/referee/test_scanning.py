@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 import consistency as cs
 from consistency.diagnostics import make_record
 from consistency.referee.diagnostics.monitor import GateRatios
-from consistency.referee.pages.ratio_figures import bound_figures
-from consistency.referee.pages.record_figures import monitor_drawing, record_figures
+from consistency.referee.pages.ratio_figures import bound_figures, monitor_drawing
+from consistency.referee.pages.record_figures import record_figures
 from consistency.referee.pages.verdicts import time_axis_of
 from consistency.referee.pages.write_pages import compose_files
 from consistency.referee.readers.formats.innovation_files import NisLog

@@ -23,9 +23,9 @@ from consistency.referee.gating.session import (
     Ledger,
     RunningTest,
     current,
-    folder_fault,
     in_place_rate,
     is_shown,
+    pages_fault,
     path_fault,
     to_property,
     watching,
@@ -62,7 +62,7 @@ def pytest_configure(config: pytest.Config) -> None:
         raise pytest.UsageError(why)
     pages = config.getoption("--consistency-pages")
     folder = None if pages is None else config.invocation_params.dir / pages
-    if folder is not None and not worker and (why := folder_fault(folder)):
+    if folder is not None and not worker and (why := pages_fault(folder)):
         raise pytest.UsageError(why)
     config.pluginmanager.register(Gates(config, runs, path, folder, _budget(config), worker), NAME)
 

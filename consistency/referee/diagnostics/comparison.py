@@ -117,7 +117,7 @@ def summary(
     return RunSummary(runs, dof, means / dof, squared, covered, kind)
 
 
-def summary_of(record: Record) -> RunSummary:
+def summary_of_runs(record: Record) -> RunSummary:
     """A row for each run of a record that has NEES; numbers of ensembles have no RMSE, and say what they are."""
     nees = record.errors.nees
     assert nees is not None

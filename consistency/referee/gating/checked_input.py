@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from consistency.referee.column_names import POSE
-from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary_of
+from consistency.referee.diagnostics.comparison import Comparison, FailedRuns, RunSummary, compare, summary_of_runs
 from consistency.referee.diagnostics.number_of_runs import gate_runs
 from consistency.referee.diagnostics.record import InnovationRecord, Record, Skip, skip_of
 from consistency.referee.diagnostics.verdict_parts import Settings
@@ -418,7 +418,7 @@ def _side(side: str, name: str, arrays: Mapping[str, Any]) -> tuple[Record, RunS
     except ValueError as error:
         raise ValueError(f"{side}: {error}") from None
     assert case.errors.nees is not None
-    return case, summary_of(case)
+    return case, summary_of_runs(case)
 
 
 def of_filters(

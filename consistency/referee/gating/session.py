@@ -373,7 +373,7 @@ def is_shown(e: Entry) -> bool:
     return bool(e.page) and e.outcome != "passed" and not wanted(e)
 
 
-def folder_fault(folder: Path) -> str:
+def pages_fault(folder: Path) -> str:
     """Why pages cannot be written to a folder, which is made if it is missing; '' if they can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

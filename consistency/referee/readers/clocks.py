@@ -54,7 +54,7 @@ class Offset:
 
 
 @dataclass(frozen=True)
-class Sample:
+class ClockSample:
     """Estimates of a run by which clocks are compared, N of them, in some components of their error."""
 
     poses: Poses
@@ -69,23 +69,23 @@ class Sample:
         """NEES over its degrees of freedom with the truth ``shift`` s later, (N,); NaN where there is none."""
         return np.asarray(np.square(self.whitened(self.poses.errors(shift))).mean(axis=1))
 
-    def some(self, most: int) -> Sample:
+    def some(self, most: int) -> ClockSample:
         """At most ``most`` estimates, evenly chosen."""
         rows = evenly(len(self.factors), most)
         return replace(self, poses=self.poses.of_rows(rows), factors=self.factors[rows])
 
 
-def sample_of(poses: Poses, axes: Sequence[int]) -> Sample:
+def clock_sample(poses: Poses, axes: Sequence[int]) -> ClockSample:
     """The finite estimates of a run, with the factors of their covariances."""
     poses = poses.sound()
     P = submatrices(poses.own.covariance, axes)
     factors = np.empty(P.shape)  # filled column by column: a second copy of a million of them is 300 MB
     for j, unit in enumerate(np.eye(len(axes))):
         factors[..., j] = whiten(np.broadcast_to(unit, P.shape[:2]), P)
-    return Sample(poses, axes, factors)
+    return ClockSample(poses, axes, factors)
 
 
-def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> list[Sample]:
+def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> list[ClockSample]:
     """At most ``RUNS`` runs, evenly chosen, in the judged components that change in their estimates.
 
     A component that never changes, as the height of a robot in the plane, says nothing about time, and its error may be
@@ -95,7 +95,7 @@ def samples_of(runs: Sequence[Poses], judged: Sequence[int] | None = None) -> li
         judged = range(runs[0].own.covariance.shape[-1])
     idle = unchanging(runs, [p.own.estimate for p in runs])
     axes = [i for i in judged if not idle[i]] or list(judged)
-    return [sample_of(runs[k], axes) for k in evenly(len(runs), RUNS)]
+    return [clock_sample(runs[k], axes) for k in evenly(len(runs), RUNS)]
 
 
 def clock_shift(
@@ -130,7 +130,7 @@ def clock_shift(
     ]
 
 
-def offset_of(samples: Sequence[Sample]) -> Offset | None:
+def offset_of(samples: Sequence[ClockSample]) -> Offset | None:
     """The offset of the clocks that fits best; None where nothing moves, or the data are too few.
 
     The offset minimises the NEES (capped) within a second; one Gauss-Newton step in each run, or in each of
@@ -163,7 +163,7 @@ def offset_of(samples: Sequence[Sample]) -> Offset | None:
         return None
     value = refined(lambda shift: size(squares(shift)), sizes, 1e-5)
     parts = 1 if len(some) > 1 else PARTS
-    each = np.concatenate([steps_of(sample, value, parts) for sample in some])
+    each = np.concatenate([time_steps(sample, value, parts) for sample in some])
     each = value + each[np.isfinite(each)]
     if len(each) < 3:
         return None
@@ -193,7 +193,7 @@ def refined(size: Callable[[float], float], sizes: Array, tolerance: float) -> f
     return float(found.x if found.fun < sizes[best] else GRID[best])
 
 
-def shows_in_estimates(samples: Sequence[Sample], value: float) -> bool:
+def shows_in_estimates(samples: Sequence[ClockSample], value: float) -> bool:
     """Whether the motion of the estimates, in place of that of the truth, tells of an offset of the same sign.
 
     A right filter's error is correlated with the true motion, which may look like an offset, and with no earlier
@@ -213,14 +213,14 @@ def shows_in_estimates(samples: Sequence[Sample], value: float) -> bool:
         return bool(np.sign(-value) * top / bottom > least)
 
 
-def steps_of(sample: Sample, shift: float, parts: int) -> Array:
+def time_steps(sample: ClockSample, shift: float, parts: int) -> Array:
     """Gauss-Newton step from ``shift`` in each part, s; NaN where nothing moves."""
     e, v = _errors_and_motion(sample, shift)
     sums = _sums_of_parts(v, e, v, parts)
     return np.array([-top / bottom if bottom > 0 else np.nan for top, bottom in sums])
 
 
-def _estimate_sums(sample: Sample, parts: int) -> Array:
+def _estimate_sums(sample: ClockSample, parts: int) -> Array:
     """Sums as in :func:`_sums_of_parts`, along the motion of the estimates between the two rows before."""
     e, v = _errors_and_motion(sample, 0.0)
     poses = sample.poses
@@ -230,7 +230,7 @@ def _estimate_sums(sample: Sample, parts: int) -> Array:
     return _sums_of_parts(sample.whitened(before), e, v, parts)
 
 
-def _errors_and_motion(sample: Sample, shift: float) -> tuple[Array, Array]:
+def _errors_and_motion(sample: ClockSample, shift: float) -> tuple[Array, Array]:
     """Errors at ``shift`` and their derivative by it, both whitened, (N, n)."""
     errors = sample.poses.errors
     moved = (errors(shift + STEP) - errors(shift - STEP)) / (2.0 * STEP)
@@ -248,7 +248,7 @@ def _sums_of_parts(along: Array, e: Array, v: Array, parts: int) -> Array:
     return np.array([products[rows].sum(axis=0) for rows in groups])
 
 
-def unit_of(t: Array, unit: int | None = None) -> int:
+def time_unit(t: Array, unit: int | None = None) -> int:
     """How many units of times are a second: what their name says, or what times since 1970 are large enough for."""
     if unit is not None:
         return unit
@@ -258,7 +258,7 @@ def unit_of(t: Array, unit: int | None = None) -> int:
 
 def unit_apart(t: Array, other_t: Array, names: Sequence[Path | str]) -> str:
     """Which of two files seems to have times in another unit than seconds, as the end of a sentence; "" of neither."""
-    units = unit_of(t), unit_of(other_t)
+    units = time_unit(t), time_unit(other_t)
     for unit in sorted(UNIT_NAMES, reverse=True):  # the smallest that makes them overlap, 1 where they do
         if _overlap(t / unit, other_t):
             units = unit, 1

@@ -16,7 +16,14 @@ import numpy as np
 
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, POWER
-from consistency.referee.diagnostics.comparison import FEWEST, Comparison, FailedRuns, RunSummary, compare, summary_of
+from consistency.referee.diagnostics.comparison import (
+    FEWEST,
+    Comparison,
+    FailedRuns,
+    RunSummary,
+    compare,
+    summary_of_runs,
+)
 from consistency.referee.diagnostics.record import Record, Skip, numbered_axes
 from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.errors import InputError
@@ -258,7 +265,7 @@ def baseline(
         own = record
         if not record.origin.unshown:
             own = record.as_runs
-        filters[each] = summary_of(own)
+        filters[each] = summary_of_runs(own)
     trials = source.trials
     if SourceOptions(truth=truth).repeats:
         trials = (REPEATS, None)  # runs of one number are taken as one trial

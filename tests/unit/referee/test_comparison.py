@@ -15,7 +15,7 @@ from scipy import optimize, special, stats
 import consistency as cs
 from consistency.bench.runs.results_to_records import results_source
 from consistency.diagnostics import Comparison, RunSummary, compare, summary
-from consistency.referee.diagnostics.comparison import summary_of
+from consistency.referee.diagnostics.comparison import summary_of_runs
 from consistency.referee.diagnostics.nees import Contrast, contrast, margin
 from consistency.referee.gating.session import RunningTest, needed_at, watching
 from consistency.referee.verdicts.compare_sources import (
@@ -484,7 +484,7 @@ def test_members_are_compared_as_numbers_of_one_kind(tmp_path, capsys):
     assert found["worse"]
     assert [d["name"] for d in found["differences"]] == ["ANEES"]  # their RMSE has no unit
     kind = found["sentence"].partition("Both are ")[2]
-    summary_of_a = summary_of(cs.read(a, members={"x": "ex*"}))
+    summary_of_a = summary_of_runs(cs.read(a, members={"x": "ex*"}))
     assert summary_of_a.runs.tolist() == list(range(3, 43))
     shown = summary_of_a.kind
     assert kind == shown
@@ -540,8 +540,8 @@ def test_runs_of_members_are_planned_by_what_their_numbers_show():
     with watching(RunningTest(keep=entries.append)), pytest.raises(InsufficientTrials) as found:
         assert_not_worse(members_a=draws, members_b=-draws, truth=truth, false_alarm=1e-6, detect=1.5)
     sides = (
-        summary_of(cs.judge(members=draws, truth=truth).record),
-        summary_of(cs.judge(members=-draws, truth=truth).record),
+        summary_of_runs(cs.judge(members=draws, truth=truth).record),
+        summary_of_runs(cs.judge(members=-draws, truth=truth).record),
     )
     assert found.value.needed > 1.3 * compare(*sides, 1e-6).needed_runs(1.5, 0.95)
 

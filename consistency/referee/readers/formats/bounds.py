@@ -120,7 +120,7 @@ def levels_of(given: Any) -> OfBounds[Level]:
     return OfBounds("--level", level_of_text, given)
 
 
-def limits_of(given: Any) -> OfBounds[float]:
+def alert_limits(given: Any) -> OfBounds[float]:
     """Alert limits of bounds, where such are given; raises InputError for what is none."""
     return OfBounds("--alert-limit", limit_of_text, given)
 
@@ -138,7 +138,7 @@ def require_bound_options(r: Reading) -> None:
             raise InputError(f"{flag}: is for bounds; with --gaussian covariances are judged, so leave it out")
     if stated.level is not None:
         levels_of(stated.level)
-    limits_of(stated.alert_limit)
+    alert_limits(stated.alert_limit)
     if stated.level is not None and not stated.gaussian:
         others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
         r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
@@ -243,7 +243,7 @@ def _stated(
     options: StatementOptions,
 ) -> Bounds:
     """Bounds by their names, of which the first is shown, and the components that they bound."""
-    levels, limits = levels_of(options.level), limits_of(options.alert_limit)
+    levels, limits = levels_of(options.level), alert_limits(options.alert_limit)
     known = list(dict.fromkeys(name for each in names for name in each))
     levels.require(known)
     limits.require(known)

@@ -12,7 +12,7 @@ import numpy as np
 from consistency.referee.column_names import OWN_COVARIANCE, POSE
 from consistency.referee.diagnostics.number_words import plural
 from consistency.referee.errors import InputError
-from consistency.referee.readers.clocks import unit_of
+from consistency.referee.readers.clocks import time_unit
 from consistency.referee.readers.formats.columns import (
     HEADINGS,
     OWN,
@@ -203,7 +203,7 @@ def times_of(rows: FileRows, clock: Clock, columns: Sequence[Array]) -> tuple[Ar
     unit = 10**9
     rough = columns[0] + columns[-1] / unit
     if len(columns) == 1:
-        unit = unit_of(columns[0], clock.unit)
+        unit = time_unit(columns[0], clock.unit)
         rough = columns[0] / unit
     if unit < 10**9 or rows.unit != "line" or (np.diff(rows.line) <= 0).any():
         return rough, unit

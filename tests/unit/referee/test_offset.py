@@ -11,13 +11,13 @@ import consistency as cs
 from consistency.referee.geometry import wrap
 from consistency.referee.readers import clocks
 from consistency.referee.readers.clocks import (
+    ClockSample,
     Offset,
-    Sample,
     clock_shift,
     offset_of,
     samples_of,
     shows_in_estimates,
-    steps_of,
+    time_steps,
 )
 from consistency.referee.readers.places import Places
 from consistency.referee.readers.truth_matching import make_poses
@@ -96,14 +96,14 @@ def test_without_noise_it_is_found_to_the_millisecond(rng, offset):
 
 
 def test_a_step_goes_to_the_offset(rng):
-    steps = steps_of(*samples_of([run_of(rng, 0.02, noise=1e-3)]), 0.0, 3)
+    steps = time_steps(*samples_of([run_of(rng, 0.02, noise=1e-3)]), 0.0, 3)
     assert_allclose(steps, 0.02, atol=2e-3)
 
 
 def test_the_interval_by_hand(rng, monkeypatch):
     """Student's t of the steps that five runs would go from the offset: 2.7764 standard errors with 4 of freedom."""
     steps = iter([0.001, -0.002, 0.004, 0.0, 0.002])
-    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.array([next(steps)]))
+    monkeypatch.setattr(clocks, "time_steps", lambda *_: np.array([next(steps)]))
     found = offset_of(samples_of([run_of(rng, 0.04, noise=1e-3) for _ in range(5)]))
     reach = 2.776445 * np.sqrt(5e-6 / 5)  # squares about the mean of 0.001 add up to 20e-6
     assert found.high - found.value == pytest.approx(reach, rel=1e-6)
@@ -125,8 +125,8 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alo
         return np.array([0.001, -0.001, np.nan, 0.0])
 
     slope = (nees - then) / 0.04**2
-    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: then + slope * (shift - 0.04) ** 2))
-    monkeypatch.setattr(clocks, "steps_of", steps)
+    monkeypatch.setattr(ClockSample, "squares", sizes(lambda shift: then + slope * (shift - 0.04) ** 2))
+    monkeypatch.setattr(clocks, "time_steps", steps)
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert asked == [12]
     assert found.alone is alone
@@ -140,15 +140,15 @@ def test_a_single_run_tells_of_its_clock_where_it_is_grossly_off(nees, then, alo
 
 @pytest.mark.parametrize("steps, p", [((0.0, 0.0), None), ((0.0, np.nan, 0.0), None), ((0.0, 0.0, 0.0), 0.0)])
 def test_steps_that_agree_are_certain_and_two_are_none(steps, p, rng, monkeypatch):
-    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + (shift - 0.04) ** 2))
-    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.array(steps))
+    monkeypatch.setattr(ClockSample, "squares", sizes(lambda shift: 1.0 + (shift - 0.04) ** 2))
+    monkeypatch.setattr(clocks, "time_steps", lambda *_: np.array(steps))
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (None if found is None else found.p_value) == p
 
 
 def test_steps_that_agree_on_no_offset_find_none(rng, monkeypatch):
-    monkeypatch.setattr(Sample, "squares", sizes(lambda shift: 1.0 + abs(shift)))
-    monkeypatch.setattr(clocks, "steps_of", lambda *_: np.zeros(4))
+    monkeypatch.setattr(ClockSample, "squares", sizes(lambda shift: 1.0 + abs(shift)))
+    monkeypatch.setattr(clocks, "time_steps", lambda *_: np.zeros(4))
     found = offset_of(samples_of([run_of(rng, 0.0)]))
     assert (found.value, found.p_value) == (0.0, 1.0)
 

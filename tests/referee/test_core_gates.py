@@ -91,7 +91,7 @@ def test_a_session_with_gates(session):
 
 def test_a_session_with_one_false_alarm_rate(session):
     words = ("--consistency-false-alarm=0.01", "--consistency-report=gates.html")
-    result = session.runpytest(*words)
+    result = session.run(sys.executable, "-m", "pytest", *words)
     result.assert_outcomes(passed=2, failed=2)
     result.stdout.fnmatch_lines(["consistency: false-alarm budget 0.01 for the session"])
     page = (session.path / "gates.html").read_text()
@@ -100,6 +100,6 @@ def test_a_session_with_one_false_alarm_rate(session):
 
 
 def test_a_bad_option_ends_the_session(session):
-    result = session.runpytest("--consistency-runs=0")
+    result = session.run(sys.executable, "-m", "pytest", "--consistency-runs=0")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*--consistency-runs must be at least 1, got 0*"])

@@ -244,7 +244,7 @@ def test_an_undecided_correction_is_written_and_marked(tmp_path, capsys):
     out, _ = consistency(capsys, "correct", estimates, "--truth", truth, "--out", tmp_path / "c")
     assert "undecided after" in out
     assert "runs would decide" in out
-    assert "are uncertain" not in out
+    assert "factors of 5 runs are uncertain, which adds x1." in out
     assert (tmp_path / "c/correction.toml").read_text().startswith("# undecided after")
     consistency(capsys, "correct", estimates, "--truth", truth, "--fail-on", "inconsistent", status=1)
 

@@ -1,6 +1,7 @@
 """The tree of a document, and renderers that show the same tree."""
 
 import json as standard
+import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -30,6 +31,7 @@ from consistency.referee.show.blocks import (
     Stack,
     Status,
     Text,
+    badges,
     fragment,
     style,
     table,
@@ -298,3 +300,28 @@ def test_a_fault_of_one_question_alone_has_its_sentence():
     both = tuple(replace(a, found=a.question in ("distribution", "outliers")) for a in v.answers)
     assert ALONE["distribution"] not in reasons(replace(alone, answers=both))[0]
     assert set(ALONE) <= set(ABOUT)
+
+
+def test_a_terminal_has_numbers_at_the_right_and_verdicts_in_their_colours(capsys, monkeypatch):
+    columns = (Column("name"), Column("ratio", number=True), Column("verdict"))
+    rows = (("a", Quantity(1.5), Status("overconfident")), ("b", Quantity(12.25), Status("consistent")))
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    terminal.show(table(columns, rows, "Ratios"))
+    shown = capsys.readouterr().out
+    assert "\x1b[31moverconfident" in shown
+    assert "\x1b[32mconsistent" in shown
+    first, second = (re.sub(r"\x1b\[[\d;]*m", "", line) for line in shown.splitlines()[1:])
+    assert first.index("overconfident") == second.index("consistent")
+    assert len(first[: first.index("overconfident")].rstrip()) == len(second[: second.index("consistent")].rstrip())
+
+
+@pytest.mark.parametrize(
+    "named, shown",
+    [
+        ([("mine", "consistent")], ["consistent"]),
+        ([("mine", "consistent"), ("yours", "biased")], ["consistent mine", "biased yours"]),
+        ([(f"f{k}", "failed" if k else "consistent") for k in range(9)], ["consistent 1", "failed 8"]),
+    ],
+)
+def test_badges_are_the_words_of_verdicts(named, shown):
+    assert [badge.text + badge.note for badge in badges(named)] == shown

@@ -304,7 +304,7 @@ def test_a_fault_of_one_question_alone_has_its_sentence():
 
 def test_a_terminal_has_numbers_at_the_right_and_verdicts_in_their_colours(capsys, monkeypatch):
     columns = (Column("name"), Column("ratio", number=True), Column("verdict"))
-    rows = (("a", Quantity(1.5), Status("overconfident")), ("b", Quantity(12.25), Status("consistent")))
+    rows = (("a", Quantity(1.5), Status("overconfident")), ("b", Quantity(123.4), Status("consistent")))
     monkeypatch.setenv("FORCE_COLOR", "1")
     terminal.show(table(columns, rows, "Ratios"))
     shown = capsys.readouterr().out

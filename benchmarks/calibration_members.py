@@ -84,10 +84,10 @@ def cases() -> list[tuple[str, Callable[..., Verdict], tuple[Any, ...], int, int
     found: list[tuple[str, Callable[..., Verdict], tuple[Any, ...], int, int]] = []
     for case in (*RANKS, *WIDE):
         m, n, shape, errors = case
-        gates = SLOW_GATES if case in WIDE else SOME_GATES
+        gates = SLOW_GATES if case in WIDE else GATES if n == 1 else SOME_GATES
         found.append((f"{m} members, n = {n}, {shape}, {errors}", of_ranks, case, RUNS, gates))
     for N, n, errors in ENSEMBLES:
-        gates = SLOW_GATES if n > N else SOME_GATES
+        gates = SLOW_GATES if n > N else SOME_GATES if N == 50 else GATES
         found.append((f"--ensemble {N}, n = {n}, {errors}", of_ensemble, (N, n, errors), RUNS, gates))
     for N, n, spread in REPEATS:
         found.append((f"{N} repeats, n = {n}, spread {spread:g}", of_repeats, (N, n, spread), N, GATES))

@@ -351,11 +351,13 @@ def _ratios(v: Findings, s: Scale, worst: str, of_worst: Interval) -> str:
     """
     text = f"covariance ratio of the worst axis{since_text(v)}: {worst}, {ratio_text(of_worst)}"
     assert v.axes is not None
-    names = list(v.axes.names)
-    for block, members in (("position", POSITION), ("attitude", ATTITUDE)):
-        own = [name for name in names if name in members]
-        ratio = v.axes.inflation.get(block if len(own) > 1 else "".join(own))
-        if ratio is not None and POSITION & {*names} and ATTITUDE & {*names} and own != [worst]:
+    blocks = {
+        block: [name for name in v.axes.names if name in members]
+        for block, members in (("position", POSITION), ("attitude", ATTITUDE))
+    }
+    for block, own in blocks.items() if all(blocks.values()) else ():
+        ratio = v.axes.inflation.get(block if len(own) > 1 else own[0])
+        if ratio is not None and own != [worst]:
             text += f"; {block} {ratio_text(ratio)}"
     text += f"; all axes {ratio_text(s.inflation)}, in sigmas x{short(float(np.sqrt(s.inflation.value)))}"
     if v.location is not None and v.location.since is not None:

@@ -304,9 +304,7 @@ def _write_bounds(found: BoundCorrection, groups: Groups | None, files: Sequence
         if not files or (of_runs is not None and not (are_known and found.after.unit == "run")):
             continue  # pieces and rows of one log are not told in its file
         (folder / name).mkdir()
-        for file in files:
-            if of_runs is None or file.run_column is not None or file.run in of_runs:
-                (folder / name / file.path.name).write_text(file.restated(partial(change, of_runs)), encoding="utf-8")
+        _restate(folder / name, files, of_runs, partial(change, of_runs))
         made.append(f"{name}/{files[0].path.name}" if len(files) == 1 else name)
     return made
 
@@ -340,11 +338,18 @@ def _write_one(
         _write_archive(folder / f"{found.name}.npz", record, of_runs)
         return f"{folder.name}/{found.name}.npz"
     change = partial(_change, found.axes, record.groups, of_runs, found.assumed)
-    for file in files:
-        if file.run_column is not None or file.run in of_runs:
-            (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
+    _restate(folder, files, of_runs, change)
     made = [path.name for path in folder.iterdir()]
     return f"{folder.name}/{made[0]}" if len(made) == 1 else folder.name
+
+
+def _restate(
+    folder: Path, files: Sequence[TextFile], of_runs: Mapping[int, object] | None, change: Callable[..., Factors | None]
+) -> None:
+    """Write files with their statements changed: with ``of_runs`` those of these runs, or that tell runs apart."""
+    for file in files:
+        if of_runs is None or file.run_column is not None or file.run in of_runs:
+            (folder / file.path.name).write_text(file.restated(change), encoding="utf-8")
 
 
 def _change(

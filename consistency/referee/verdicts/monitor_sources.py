@@ -37,9 +37,9 @@ from consistency.referee.verdicts.judge_sources import refused
 OPTIMAL = "optimal"
 SHOWN = 4  # dimensions of innovations, of which the smallest spike is printed
 NO_NIS = (
-    "These are test ratios and no NIS: the log does not hold the variances of the innovations. So there is no verdict "
-    "and no alarm. A ratio above 1 was rejected. A right filter has no larger shares than the table says, up to "
-    "chance; smaller shares do not show that it is right."
+    "These are test ratios and no NIS: the log does not hold the variances of the innovations, which allows "
+    "no verdict and no alarm. A ratio above 1 was rejected. A right filter has no larger shares than the table says, "
+    "up to chance; smaller shares do not show that it is right."
 )
 HEADS = (
     "gate",

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,6 +136,27 @@ def test_groups_have_factors_of_their_own(tmp_path, capsys):
         expected = np.where(record.groups.index == place, expected / of.left_out[:, None], expected)
         assert number >= 0
     assert found.rates["bound_x"].value == pytest.approx((expected > 1).mean())
+
+
+def test_a_step_without_a_group_has_the_factor_of_all(tmp_path):
+    record = cs.read(table(tmp_path / "rx.csv"), level=0.9, by="light")
+    index = record.groups.index.copy()
+    index[:, 5] = -1
+    record = replace(record, groups=replace(record.groups, index=index))
+    found = cs.correct(record)
+    expected = np.abs(record.errors.bound_ratios[..., 0])
+    for of in found.factors:
+        here = index == (record.groups.names.index(of.group) if of.group else -1)
+        expected = np.where(here, expected / of.left_out[:, None], expected)
+    assert found.rates["bound_x"].value == pytest.approx((expected > 1).mean())
+
+
+def test_corrected_bounds_are_not_compared_with_an_alert_limit(tmp_path):
+    """The regions are those of the bounds that were stated."""
+    record = cs.read(table(tmp_path / "rx.csv"), level=0.9, alert_limit=2.0)
+    assert cs.judge(record).bounds[0].alerts is not None
+    found = cs.correct(record)
+    assert [verdict.bounds[0].alerts for verdict in (found.before, found.after)] == [None, None]
 
 
 def test_tables_are_written_with_corrected_bounds(tmp_path, capsys):

@@ -120,11 +120,11 @@ def with_small_ones(height: float, many: int) -> tuple[Figure, list[Axes]]:
     from matplotlib.figure import Figure
 
     figure, columns = Figure(figsize=(WIDTH, height)), -(-many // 2)
-    grid = figure.add_gridspec(2, 1 + columns, width_ratios=(2.0, *(1.0,) * columns))
-    engine: Any = figure.get_layout_engine()
-    engine.set(h_pad=0.14)  # of a panel beside two rows it leaves out the name of the axis
-    places = [grid[:, 0], *(grid[k % 2, 1 + k // 2] for k in range(many))]
-    return figure, [figure.add_subplot(place) for place in places]
+    left, right = figure.subfigures(1, 2, width_ratios=(2.5, columns), squeeze=False)[0]
+    whole, small = left.subplots(), list(right.subplots(2, columns, squeeze=False).T.flat)
+    for empty_panel in small[many:]:
+        empty_panel.set_axis_off()
+    return figure, [whole, *small[:many]]
 
 
 def rows_of(panels: int) -> int:

@@ -121,10 +121,8 @@ def with_small_ones(height: float, many: int) -> tuple[Figure, list[Axes]]:
 
     figure, columns = Figure(figsize=(WIDTH, height)), -(-many // 2)
     left, right = figure.subfigures(1, 2, width_ratios=(2.5, columns), squeeze=False)[0]
-    whole, small = left.subplots(), list(right.subplots(2, columns, squeeze=False).T.flat)
-    for empty_panel in small[many:]:
-        empty_panel.set_axis_off()
-    return figure, [whole, *small[:many]]
+    grid = right.add_gridspec(2, columns)
+    return figure, [left.subplots(), *(right.add_subplot(grid[k % 2, k // 2]) for k in range(many))]
 
 
 def rows_of(panels: int) -> int:

@@ -70,7 +70,7 @@ def test_ellipses_stand_where_the_errors_are_largest():
     assert_allclose(crosses.get_xydata()[0], one.origin.path[0, 10, 0][[0, 2]])
     assert crosses.get_xdata()[1] == 40.0  # step 12 is beside the first and is not drawn
     assert "errors are largest against it (" in figure(one).caption
-    assert set(legend_of(axes.figure)) == {"truth", "estimate", "95 % ellipse", "truth there"}
+    assert set(legend_of(axes.figure.figure)) == {"truth", "estimate", "95 % ellipse", "truth there"}
 
 
 def test_an_ellipse_holds_95_percent():

@@ -111,7 +111,7 @@ def _over_disparity(of: Characterisation) -> Figure:
         "Standard deviation of disparity over disparity (fig. 5c). Line: noise at the nodes, with its interval. "
         "Squares: standard deviation of groups of equal size, bias and offsets in it. Rule: sigma of all together."
     )
-    return Figure("Noise over disparity", caption, (draw,))
+    return Figure("Standard deviation of disparity", caption, (draw,))
 
 
 def local_spread(of: Characterisation) -> tuple[Array, Array]:

@@ -36,6 +36,7 @@ from consistency.referee.fit_covariance.drives import PIECES, ways
 from consistency.referee.fit_covariance.factors import stated_errors
 from consistency.referee.fit_covariance.noise_model import NoiseModel, correction, data_of_model, noise_document
 from consistency.referee.fit_covariance.pictures import draw_correction, draw_noise
+from consistency.referee.pages.write_pages import note_sentence
 from consistency.referee.readers.formats.file_kinds import CORRECTED, HELD_OUT
 from consistency.referee.readers.formats.restated import Factors, TextFile
 from consistency.referee.readers.formats.sheet import EMPTY
@@ -458,8 +459,9 @@ def page_of(
     """A document with its picture; its first sentence is the answer at the top of the page."""
     sentence, *further = said.opening
     assert isinstance(sentence, Text)
+    opening = tuple(Text(note_sentence(block.text)) if isinstance(block, Text) else block for block in further)
     picture = Figure(title, caption, (draw,))
-    return replace(said, answer=sentence.text, opening=tuple(further), chapters=(Chapter("", "", "", (picture,)),))
+    return replace(said, answer=sentence.text, opening=opening, chapters=(Chapter("", "", "", (picture,)),))
 
 
 # --- noise models -----------------------------------------------------------------------------------------------------

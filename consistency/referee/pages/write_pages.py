@@ -251,7 +251,7 @@ def compose_files(
         Text(verdicts.method((study,)), "How a verdict comes about.", "note"),
     )  # fmt: skip
     notes = list(dict.fromkeys(note for name in judged for note in named[name].origin.notes))
-    read = tuple(Text(_begun(note)) for note in notes)
+    read = tuple(Text(note_sentence(note)) for note in notes)
     chapters += [
         Chapter("verdicts", "Verdict in figures", "Figures", blocks),
         Chapter("provenance", "What was read", "Files", (*read, Facts(facts(dict(manifest))))),
@@ -265,7 +265,7 @@ def answer(judged: Mapping[str, Verdict]) -> str:
     return " ".join(with_subject(name, _ended(verdict.reasons[0])) for name, verdict in judged.items())
 
 
-def _begun(note: str) -> str:
+def note_sentence(note: str) -> str:
     """A note as a sentence; a path, or the name of an estimator, at its beginning stays as it is."""
     first = note.split(maxsplit=1)[0]
     if "/" in first or first.endswith(":"):

@@ -395,8 +395,7 @@ def svg(draw: Callable[[], Figure], name: str = "figure", titles: Titles | None 
         figure.set_layout_engine("none")
     for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
         patch.set_visible(False)  # the ground is that of the page
-    kind = "narrow" if figure.get_figwidth() < WIDTH else "full"
-    return _compact(saved(figure, "svg", name=name).decode("utf-8"), kind, titles or Titles())
+    return _compact(saved(figure, "svg", name=name).decode("utf-8"), figure.get_figwidth(), titles or Titles())
 
 
 def png(draw: Callable[[], Figure], resolution: int = 200) -> bytes:
@@ -424,8 +423,8 @@ def saved(figure: Figure, kind: str, resolution: int = 200, name: str = "figure"
     return buffer.getvalue()
 
 
-def _compact(text: str, kind: str, titles: Titles) -> str:
-    """The SVG element with coordinates to a tenth of a point, classes of filters, and titles."""
+def _compact(text: str, width: float, titles: Titles) -> str:
+    """The SVG element with its width in inches, coordinates to a tenth of a point, classes of filters, and titles."""
 
     def group(match: re.Match[str]) -> str:
         name = match[1]
@@ -442,6 +441,6 @@ def _compact(text: str, kind: str, titles: Titles) -> str:
         return places
 
     text = re.sub(r"\s+", " ", text[text.index("<svg") :]).replace("> <", "><")
-    text = text.replace("<svg ", f'<svg class="{kind}" stroke-linejoin="round" ', 1).replace(STYLE, "")
+    text = text.replace("<svg ", f'<svg style="--inches: {width:g}" stroke-linejoin="round" ', 1).replace(STYLE, "")
     text = UPRIGHT.sub("", text)
     return PLACES.sub(rounded, GROUP.sub(group, text))

@@ -237,6 +237,12 @@ def test_the_ground_of_a_picture_is_that_of_the_page():
     assert "fill: #ffffff" not in text
 
 
+@pytest.mark.parametrize("width", [1.45, 5.0])
+def test_a_page_knows_the_width_of_a_drawing(width):
+    """A small drawing is not blown up to the width of the others."""
+    assert f'style="--inches: {width:g}"' in svg(lambda: canvas(1.0, width=width)[0])
+
+
 def test_a_picture_that_scrolls_is_reached_by_the_keyboard():
     figure = Figure("NEES", "", (draw,))
     assert '<div class="chart" role="img" tabindex="0" aria-label="NEES">' in as_html.render(

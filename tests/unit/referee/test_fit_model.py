@@ -162,7 +162,7 @@ def test_planar_part_of_motions_in_space(rng):
 @pytest.mark.parametrize("group", GROUPS)
 def test_an_error_of_a_piece_is_carried_to_the_end(group, rng):
     w = cut(group, rng)
-    A, n = carriers(w.pieces), len(w.axes)
+    A, n = carriers(pieces_of(w.pieces)), len(w.axes)
     perfect = replace(w, true=w.motions)
     for k in (0, 7, 20):
         e = 1e-6 * rng.normal(size=(len(A), n))
@@ -211,7 +211,7 @@ def test_a_mean_alone_is_found(group, rng):
 @pytest.mark.parametrize("group", GROUPS)
 def test_terms_are_sums_over_pieces(group, rng):
     w = cut(group, rng)
-    F, A, n = terms_of(w.pieces), carriers(w.pieces), len(w.axes)
+    F, A, n = terms_of(w.pieces), carriers(pieces_of(w.pieces)), len(w.axes)
     d = w.d
     for k, axis in ((3, 0), (5, n - 1)):
         by_hand = np.zeros((2, n, n))

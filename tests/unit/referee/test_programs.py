@@ -324,7 +324,7 @@ def test_one_truth_for_all_runs_stands_where_the_user_does(place, monte_carlo):
     assert status == 2
     assert "write --truth {here}/truth.csv" in err
     assert monte_carlo("--truth", "{here}/truth.csv", *words)[0] == 0
-    assert cs.read(place / "out").errors.error.shape == (4, STEPS, 3)  # type: ignore[union-attr]
+    assert cs.read(place / "out").errors.error.shape == (4, STEPS, 3)
 
 
 # --- runs that fail ----------------------------------------------------------------------------------------

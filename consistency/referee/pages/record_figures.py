@@ -166,6 +166,12 @@ def _span_runs(axes: Axes, record: Record) -> None:
     axes.set(xlabel=record.runs.unit, xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
+def _log_if_wide(axes: Axes, *values: Array) -> None:
+    """A log axis of values that span more than a decade."""
+    if wide(list(values)):
+        log_axis(axes, "y")
+
+
 # --- errors -----------------------------------------------------------------------------------------
 
 
@@ -375,8 +381,7 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
         curve(axes, clock.values, scale.anees, SHOWN, record.name)
         axes.set_ylabel("NEES")
         clock.name(axes)
-        if wide(drawn):
-            log_axis(axes, "y")
+        _log_if_wide(axes, *drawn)
 
     caption = (
         f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: 95 % of "
@@ -404,8 +409,7 @@ def _worst_run(record: Record) -> Picture | None:
         points(axes, np.array([float(number)]), means[[worst]], WORST, f"run {number}")
         axes.set_ylabel("mean NEES")
         _span_runs(axes, record)
-        if wide([means]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, means)
 
     def paint_worst(axes: Axes) -> None:
         _draw_band(axes, record.errors.dof)
@@ -413,8 +417,7 @@ def _worst_run(record: Record) -> Picture | None:
         curve(axes, clock.values, nees[worst], WORST, "")
         axes.set_ylabel(f"NEES of run {number}")
         clock.name(axes)
-        if wide([nees[worst]]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, nees[worst])
 
     caption = (
         f"Mean NEES of each run, and the NEES of run {number}, which has the largest; {record.errors.dof} is expected "
@@ -454,8 +457,7 @@ def _single_nees(record: Record) -> Picture | None:
             time_axis_of(record.runs.t).name(axes)
         else:
             _span_runs(axes, record)
-        if wide([nees]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, nees)
 
     plural_of = "windows" if record.runs.independent else f"{record.runs.unit}s"
     caption = (
@@ -563,8 +565,7 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
         points(axes, clock.values, ratio, EACH_RUN)
         axes.set_ylabel("NIS / dof")
         clock.name(axes)
-        if wide([ratio]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, ratio)
 
     judged = verdict.innovations is not None and verdict.innovations.judged
     caption = (

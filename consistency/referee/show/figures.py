@@ -248,12 +248,12 @@ def dodge(slot: int, slots: int) -> float:
 # --- axes ---------------------------------------------------------------------------------------------
 
 
-def name_rows(axes: Axes, labels: Sequence[str], width: int = 24) -> None:
+def name_rows(axes: Axes, labels: Sequence[str]) -> None:
     """Rows with names, from the top; every second one on a darker ground."""
     for row in range(1, len(labels), 2):
         axes.axhspan(row - 0.5, row + 0.5, color="#f5f5f5", linewidth=0, zorder=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), yticks=range(len(labels)))
-    axes.set_yticklabels([wrapped(label, width) for label in labels])
+    axes.set_yticklabels([wrapped(label, 24) for label in labels])
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False, axis="y")
 

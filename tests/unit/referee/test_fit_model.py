@@ -47,6 +47,8 @@ from consistency.referee.fit_covariance.refusals import (
     PersistentError,
     RotationGrowth,
     body_turn,
+    errors_of_second,
+    persistent_errors,
     rotation_growth,
     variance_between,
 )
@@ -446,14 +448,12 @@ def test_estimate_and_truth_are_the_same(rng):
 def test_growth_of_white_noise_and_of_a_persistent_drift(rng):
     """Power 1 within 4 standard errors of 0.1; nearly 2 where the drift of a drive outweighs its noise."""
     for drift, low, high in ((World(), 0.6, 1.4), (World(memory=2000.0, coloured=3e-3), 1.6, 2.1)):
-        made = drives(rng, 5, drift)
-        w = windows(made)
-        growth = rotation_growth(w, fit_noise(w).mean)
-        assert low < growth.power < high
-        assert growth.persists == (low > 1)
-        told = [each for each in cs.fit_covariance(made, SPAN).warnings if "errors last longer than a window" in each]
+        model = cs.fit_covariance(drives(rng, 5, drift), SPAN)
+        assert low < model.growth.power < high
+        assert model.growth.persists == (low > 1)
+        told = [each for each in model.warnings if "errors last longer than a window" in each]
         assert len(told) == (low > 1)
-        assert not growth.shrinks
+        assert not model.growth.shrinks
     short = drives(rng, 1, length=150.0)
     w = windows(short)
     assert np.isnan(rotation_growth(w, fit_noise(w).mean).power)
@@ -486,10 +486,8 @@ def test_growth_needs_its_standard_errors():
 )
 def test_terms_that_persist_are_named_from_five_drives_on(world, word, rng):
     made = drives(rng, 6, world)
-    few = cs.fit_covariance(made[:4], SPAN)
-    assert not any("differs between drives" in each for each in few.warnings)
-    assert not few.lasting
     model = cs.fit_covariance(made, SPAN)
+    assert persistent_errors(model.noise, windows(made[:4])) == ()
     told = [each for each in model.warnings if word in each]
     assert told
     assert "add a state" in told[0]
@@ -520,6 +518,7 @@ def test_a_second_estimator_with_the_same_errors(rng):
     """Errors of the truth are in both; of another odometry they are not."""
     made = drives(rng, 5, length=500.0)
     same = cs.fit_covariance(made, SPAN, second=made)
+    noise, w = same.noise, same.windows
     assert_allclose(same.second.correlation, 1.0, atol=0.05)
     assert_allclose(same.second.size, 1.0, atol=0.05)
     assert same.status != "consistent"
@@ -539,17 +538,17 @@ def test_a_second_estimator_with_the_same_errors(rng):
         return [twin(drive, sigma * rng.normal(size=(len(drive.t) - 1, 3))) for drive in made]
 
     larger = [twin(d, 3 * vectors(inverse(steps(d.truth)) @ steps(d.estimate))) for d in made]
-    found = cs.fit_covariance(made, SPAN, second=larger).second
+    found, other, rough = (errors_of_second(noise, w, each) for each in (larger, own(1.0), own(5.0)))
     assert_allclose(found.correlation, 1.0, atol=0.1)
     assert_allclose(found.size, 3.0, rtol=0.1)
-    other, rough = (cs.fit_covariance(made, SPAN, second=own(times)) for times in (1.0, 5.0))
-    assert np.abs(other.second.correlation).max() < 0.4
-    assert other.second.is_rough.tolist() == [False] * 3
-    assert rough.second.is_rough.tolist() == [True, True, False]
-    assert list(noise_lines(rough))[1].endswith("above 0.7 they are the truth's; it errs too much to tell in x, y")
-    assert "too much" not in list(noise_lines(other))[1]
+    assert np.abs(other.correlation).max() < 0.4
+    assert other.is_rough.tolist() == [False] * 3
+    assert rough.is_rough.tolist() == [True, True, False]
+    of_other, of_rough = (list(noise_lines(replace(same, second=each)))[1] for each in (other, rough))
+    assert of_rough.endswith("above 0.7 they are the truth's; it errs too much to tell in x, y")
+    assert "too much" not in of_other
     with pytest.raises(InputError, match="second"):
-        cs.fit_covariance(made, SPAN, second=[replace(each, name="else") for each in made])
+        errors_of_second(noise, w, [replace(each, name="else") for each in made])
 
 
 def test_a_second_estimator_in_space_beside_three_axes(rng):

@@ -152,7 +152,9 @@ def _cells(e: Entry) -> dict[str, Cell]:
     if e.axis:
         axis = f" in {e.axis}"
     if e.p_value is not None:
-        p = "<1e-6" if e.p_value < 1e-6 else f"{min(e.p_value, 1.0):.2g}"
+        p = f"{min(e.p_value, 1.0):.2g}"
+        if e.p_value < 1e-6:
+            p = "<1e-6"
     return {
         "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome_text(e), "verdict": Status(e.status),
         "p": p, "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),

@@ -54,7 +54,8 @@ if TYPE_CHECKING:
 
 FILTER = Column("Filter")
 IN_WORLD = 3  # of these are shown of the additive error, too
-UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("heading", "roll", "pitch", "yaw"), "rad")  # of poses
+UNITS = dict.fromkeys(("RMSE x", "RMSE y", "RMSE z"), " (m)")
+UNITS |= dict.fromkeys(("RMSE heading", "RMSE roll", "RMSE pitch", "RMSE yaw"), " (rad)")
 MAP_COLUMNS = (
     Column("Verdict on the map", "Verdict on\nthe map", width="1.2fr"),
     Column("Mean NEES / 3 of landmarks", "Mean NEES / 3\nof landmarks", number=True),
@@ -380,9 +381,8 @@ def _row(d: Difference) -> tuple[str, ...]:
     if "coverage" in d.name:
         values = (f"{100 * v:.1f} %" for v in (d.a, d.b))
         return d.name, *values, "", f"{100 * d.difference:+.1f} %", f"{100 * d.low:+.1f} to {100 * d.high:+.1f} %"
-    _, is_rmse, component = d.name.rpartition("RMSE ")
-    unit = f" ({UNITS[component]})" if is_rmse and component in UNITS else ""
-    return d.name + unit, f"{d.a:.3g}", f"{d.b:.3g}", f"x{d.difference:.3g}", "", f"{d.low:.3g} to {d.high:.3g}"
+    name = d.name + UNITS.get(d.name, "")
+    return name, f"{d.a:.3g}", f"{d.b:.3g}", f"x{d.difference:.3g}", "", f"{d.low:.3g} to {d.high:.3g}"
 
 
 def map_cells(m: MapScore) -> tuple[Cell, ...]:

@@ -38,14 +38,18 @@ from consistency.commands.shared_options import (
 from consistency.referee.column_names import POSE
 from consistency.referee.defaults import DETECT, FALSE_ALARM, GATE_FALSE_ALARM, NIS_TOLERANCE, POWER
 from consistency.referee.errors import InputError
-from consistency.referee.extras import missing, remedy
 from consistency.referee.readers.options import GROUPED, Reading, flag_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from consistency.referee.diagnostics.monitor import GateRatios
     from consistency.referee.diagnostics.record import Record
     from consistency.referee.diagnostics.record import Skip as FirstSteps
+    from consistency.referee.show.blocks import Document
     from consistency.referee.verdicts.compare_sources import Baseline
     from consistency.referee.verdicts.judge_sources import Source
+    from consistency.referee.verdicts.monitor_sources import Watched
 
 
 @reads_files
@@ -100,7 +104,6 @@ def analyse_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite files other than reports, too.")] = False,
 ) -> None:
     """Check whether stated covariances match the errors. Explain the verdict."""
-    from consistency.referee.show import FORMATS
     from consistency.referee.verdicts.judge_sources import files_source, judge_all, settings_of, skip_asked
     from consistency.referee.verdicts.tables import document
 
@@ -113,12 +116,13 @@ def analyse_command(
     written: list[Path] = []
     recordings: list[Record] = []
     refused: InputError | None = None  # of a report, said below the verdict
-    is_file = report is not None and report.suffix.lower() in FORMATS.keys() - {".html", ".json"}  # a folder has both
+    is_folder = False
     require_written(overwrite, report, "--report")
     if report is not None:
-        from consistency.referee.pages.write_pages import require_report
+        from consistency.referee.pages.write_pages import is_one_file, require_report
 
         overwrite = require_report(report, overwrite)
+        is_folder = not is_one_file(report)
     if are_files(path, files):
         try:
             recordings = [recording.without_first(first) for recording in read_files(path, files)]
@@ -134,7 +138,7 @@ def analyse_command(
         from consistency.bench.runs.results_to_records import results_source
 
         results = results_source(path)
-        if report is not None and not is_file:
+        if is_folder:
             raise InputError(f"--report: is for files of another estimator; for {path} use 'consistency report {path}'")
         if innovations is not None:
             raise InputError(
@@ -146,17 +150,10 @@ def analyse_command(
     print_document(shown, as_json)
     sys.stdout.flush()  # whatever becomes of the pictures
     if report is not None:
-        from consistency.referee.pages.write_pages import write_file_reports, write_text_file
-        from consistency.referee.show.as_json import render
+        from consistency.commands.program_reports import write_verdicts
 
         try:
-            if is_file:
-                written = [write_text_file(shown, report)]
-            else:
-                data = render(document(verdicts))
-                written = write_file_reports(recordings, verdicts, report, path.name, data, overwrite)
-                if missing("report"):
-                    print(f"consistency: pictures and the PDF need {remedy('report')}", file=sys.stderr)
+            written = write_verdicts(recordings, verdicts, shown, report, None, overwrite)
         except InputError as error:
             refused = error
     if not as_json:
@@ -448,7 +445,7 @@ def monitor_command(
     fail_on: Annotated[str | None, typer.Option("--fail-on", help="'alarm': exit with status 1 on an alarm.")] = None,
 ) -> None:
     """Watch the innovations of a deployed filter. Raise an alarm if their size is not what the filter states."""
-    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.pages.write_pages import require_plot
     from consistency.referee.readers.formats.flight_logs import STATED, is_dataflash
     from consistency.referee.readers.formats.innovation_files import refuse_options
     from consistency.referee.verdicts.judge_sources import skip_asked
@@ -492,16 +489,9 @@ def monitor_command(
         if plot is not None:
             require_plot(plot, overwrite)
         watched = watch(log, watcher)
-    print_document(
-        monitor_document(
-            watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t, min(watched.t, default=0.0)
-        ),
-        as_json,
-    )
-    if plot is not None:
-        from consistency.referee.pages.ratio_figures import monitor_drawing
-
-        plotted(partial(monitor_drawing, watched), plot)
+    start = min(watched.t, default=0.0)
+    said = monitor_document(watched.name, watched.monitor, watched.alarm, watched.alarm_t, watched.since_t, start)
+    _print_and_plot(said, as_json, watched, plot)
     if fail_on and watched.alarm is not None:
         raise typer.Exit(1)
 
@@ -510,7 +500,7 @@ def _show_ratios(
     path: Path, sensor: str | None, core: int | None, plot: Path | None, overwrite: bool, as_json: bool
 ) -> None:
     """Test ratios of a log that holds no variances of its innovations, of which nothing is judged."""
-    from consistency.referee.pages.write_pages import plotted, require_plot
+    from consistency.referee.pages.write_pages import require_plot
     from consistency.referee.readers.formats.flight_logs import read_ratios
     from consistency.referee.verdicts.monitor_sources import ratios_document
 
@@ -518,8 +508,13 @@ def _show_ratios(
         require_plot(plot, overwrite)
     ratios, notes = read_ratios(path, sensor, core)
     tell(notes)
-    print_document(ratios_document(path.stem, ratios), as_json)
+    _print_and_plot(ratios_document(path.stem, ratios), as_json, ratios, plot)
+
+
+def _print_and_plot(said: Document, as_json: bool, shown: Watched | Sequence[GateRatios], plot: Path | None) -> None:
+    print_document(said, as_json)
     if plot is not None:
         from consistency.referee.pages.ratio_figures import monitor_drawing
+        from consistency.referee.pages.write_pages import plotted
 
-        plotted(partial(monitor_drawing, ratios), plot)
+        plotted(partial(monitor_drawing, shown), plot)

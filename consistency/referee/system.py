@@ -26,7 +26,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
 from datetime import datetime, timezone
 from functools import cache
@@ -61,7 +61,7 @@ _quiet = ContextVar("quiet", default=False)
 
 
 def require_free(folder: Path, overwrite: bool, kind: str = "results", option: str = "--out") -> None:
-    """Refuse, before any work, a folder that exists or cannot be made.
+    """Refuse, before any work, a folder that exists or cannot be made; one that was being replaced is put back.
 
     With ``overwrite`` only a folder that this bench wrote may be replaced, and only by one of its own
     ``kind`` (results, log, findings).
@@ -71,7 +71,11 @@ def require_free(folder: Path, overwrite: bool, kind: str = "results", option: s
     except (OSError, ValueError) as error:
         raise InputError(f"{option} {one_line(folder)}: no folder can have that name ({one_line(error, 60)})") from None
     with writing(folder, option):
-        _clear(folder)
+        for left in left_beside(folder, _above(folder)):  # by commands that were killed
+            replaced = left / "replaced"
+            if replaced.exists() and not folder.exists():
+                os.replace(replaced, folder)
+            shutil.rmtree(left)
     if folder.exists() or folder.is_symlink():
         if not overwrite:
             raise InputError(f"{option} {folder}: exists already; choose another folder or add --overwrite {IN_PYTHON}")
@@ -150,11 +154,9 @@ class NewFolder:
             AT_STOP.remove(self._removal)
         shutil.rmtree(self.path, ignore_errors=True)
 
-    @contextmanager
-    def writing(self) -> Iterator[None]:
+    def writing(self) -> AbstractContextManager[None]:
         """Where the system refuses, say it of the option ``--out``."""
-        with writing(self.folder):
-            yield
+        return writing(self.folder)
 
     def put_in_place(self, manifest: dict[str, Any]) -> None:
         """Write the manifest and move the folder to its place as a whole.
@@ -193,15 +195,6 @@ class NewFolder:
 def unfinished_of(out: Path) -> Path:
     """Return the folder beside an output folder in which unfinished work on it is kept."""
     return out.absolute().parent / f".{out.absolute().name}.unfinished"
-
-
-def _clear(folder: Path) -> None:
-    """Remove what commands that were killed have left, and put back the folder that one was replacing."""
-    for left in left_beside(folder, _above(folder)):
-        replaced = left / "replaced"
-        if replaced.exists() and not folder.exists():
-            os.replace(replaced, folder)
-        shutil.rmtree(left)
 
 
 def _above(folder: Path) -> Path:
@@ -359,6 +352,15 @@ def digest_of_sources(root: Path, places: Iterable[str]) -> str:
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def digest_of_file(path: Path) -> bytes:
+    """SHA-256 of a file of any size."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        for piece in iter(lambda: file.read(2**20), b""):
+            digest.update(piece)
+    return digest.digest()
 
 
 def this_machine() -> dict[str, str]:

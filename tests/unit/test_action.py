@@ -323,7 +323,7 @@ def test_options_that_compare_lacks_are_left_out(gate):
 
 
 def options_of(name):
-    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    command = typer.main.get_command(app).commands[name]
     return {option for parameter in command.params for option in parameter.opts}
 
 

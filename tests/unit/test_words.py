@@ -592,16 +592,6 @@ def test_innovations_of_a_declared_gain_count(rng):
     assert verdict.reasons[0] == f"inconsistent: {size}"
     only = judge(make_record("f", optimal_gain=True, **nis), Settings(SURE))
     assert only.reasons[0] == f"overconfident: {size}; no truth: most pose errors cannot be seen"
-    u = independent(rng, 60, 20, 2)
-    u[:, 1:] = 0.6 * u[:, :-1] + 0.8 * u[:, 1:]
-    correlated = judge(
-        make_record(
-            "f", error, identities(error), innovations=u, innovation_covariances=identities(u), optimal_gain=True
-        ),
-        Settings(SURE),
-    )
-    assert "innovation whiteness" in correlated.faults
-    assert "innovations correlated over steps" in correlated.reasons[0]
 
 
 # --- anything at all ---------------------------------------------------------------------------------------
@@ -646,7 +636,6 @@ def evidence(draw):
 
 def only_one_run_errs(evidence):
     """What the next test is for."""
-    assert evidence.errors.error is not None
     return int((np.nan_to_num(evidence.errors.error) != 0.0).any(axis=(1, 2)).sum()) == 1
 
 

@@ -151,7 +151,6 @@ class Correction:
         return plotted(partial(draw_correction, self), path)
 
     def __repr__(self) -> str:
-
         return f"<Correction {self.name}: {correction_sentence(self)}>"
 
 

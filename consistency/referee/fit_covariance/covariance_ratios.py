@@ -123,7 +123,11 @@ def folds_of(
     """
     every = np.arange(len(windows.drives))
     if held_out == HALF:
-        since = [np.array([_middle(windows.last[windows.drive == i]) for i in every])]
+        half_time = np.zeros(len(every), int)
+        for i in np.unique(windows.drive):
+            ends = windows.last[windows.drive == i]
+            half_time[i] = ends[(len(ends) - 1) // 2]
+        since = [half_time]
     elif held_out is None:
         since = [np.where(every == i, 0, NEVER) for i in np.unique(windows.drive)]
     else:
@@ -139,11 +143,6 @@ def folds_of(
     if held_out in (None, HALF):
         return fit(windows), folds
     return folds[0].noise, folds
-
-
-def _middle(ends: Indices) -> int:
-    """Row at half time of a drive whose windows end at these rows."""
-    return int(ends[(len(ends) - 1) // 2]) if len(ends) else 0
 
 
 def named(known: Sequence[str], held_out: str, what: str = "drive") -> Indices:

@@ -94,7 +94,13 @@ def read_drives(
     offset = r.matching.time_offset
     if offset not in (None, "estimate") and not isinstance(offset, (int, float)):
         raise InputError(f"--time-offset {offset}: must be a number of seconds, or 'estimate'")
-    poses = _poses(path, r)
+    if path.is_dir() and not is_bag(path) and not trajectory_files(path, r.components.columns):
+        poses = _of_folder(path, r)
+    else:
+        kind = kind_of(path, r)
+        if kind is None or is_solution(path):
+            raise _no_poses(path)
+        poses = _of_one(path, kind.read(path, r, True), r)
     require_radians(str(path), poses)
     found = [(each, _matrices(each, r)) for each in poses]
     if offset != "estimate":
@@ -130,16 +136,6 @@ def drive_of(
     if row is None:
         row = np.arange(len(T))
     return Drive(name, np.asarray(t, float), row, composed(T) if motions else T, matrices(truth))
-
-
-def _poses(path: Path, r: Reading) -> list[Poses]:
-    """The poses of each drive, without covariances."""
-    if not is_bag(path) and path.is_dir() and not trajectory_files(path, r.components.columns):
-        return _of_folder(path, r)
-    kind = kind_of(path, r)
-    if kind is None or is_solution(path):
-        raise _no_poses(path)
-    return _of_one(path, kind.read(path, r, True), r)
 
 
 def _no_poses(path: Path) -> InputError:
@@ -302,7 +298,7 @@ class DriveWindows:
     @property
     def motions(self) -> Array:
         """Estimated motion of each window, (W, d + 1, d + 1)."""
-        return rests(self.pieces)[:, 0]
+        return rests(motion_matrices(self.pieces))[:, 0]
 
     @property
     def errors(self) -> Array:
@@ -504,9 +500,8 @@ def turn_per_way(motions: Array) -> Array:
     return angles(motions) / np.where(way > 0, way, np.inf)
 
 
-def rests(pieces: Array) -> Array:
-    """Motion from the beginning of each piece to the end of its window, (W, P, n) -> (W, P + 1, d + 1, d + 1)."""
-    T = motion_matrices(pieces)
+def rests(T: Array) -> Array:
+    """Motion from each end of a piece to the end of its window, (W, P + 1, d + 1, d + 1), of pieces as matrices."""
     W, P, size, _ = T.shape
     out = np.empty((W, P + 1, size, size))
     out[:, P] = np.eye(size)

@@ -526,14 +526,15 @@ def jacobian(pieces: Array) -> Array:
     d = d_of(pieces)
     axes = pieces.shape[-1] - d
     way = ways(pieces)
-    along = -inverse(motion_matrices(pieces))[..., :-1, -1]  # R' t: at its end a longer way is an error along it
+    T = motion_matrices(pieces)
+    along = -inverse(T)[..., :-1, -1]  # R' t: at its end a longer way is an error along it
     local = np.zeros((*pieces.shape, SCALES + axes + 1))
     local[..., :d, 0] = along
     local[..., d:, 1] = pieces[..., d:]
     local[..., d:, SCALES:-1] = way[..., None, None] * np.eye(axes)
     local[..., :d, -1] = along * turn_per_way(pieces)[..., None]
     W, P, n, p = local.shape
-    A = np.moveaxis(carriers(pieces)[:, 1:], 1, 2)
+    A = np.moveaxis(carriers(T)[:, 1:], 1, 2)
     return np.asarray(A.reshape(W, n, P * n) @ local.reshape(W, P * n, p))
 
 
@@ -542,9 +543,12 @@ def jacobian_of_mean(pieces: Array) -> Array:
     return jacobian(pieces)[..., :-1]
 
 
-def carriers(pieces: Array) -> Array:
-    """A_k (W, P + 1, n, n) that carry an error at each end of a piece to the end of the window: Ad(rest)^-1."""
-    return adjoint(inverse(rests(pieces)))
+def carriers(T: Array) -> Array:
+    """A_k (W, P + 1, n, n) that carry an error at each end of a piece to the end of the window: Ad(rest)^-1.
+
+    T (W, P, d + 1, d + 1) are the pieces.
+    """
+    return adjoint(inverse(rests(T)))
 
 
 # --- maximum likelihood -----------------------------------------------------------------------------------------------
@@ -555,7 +559,7 @@ def terms_of(pieces: Array) -> Array:
 
     The noise of a piece stands half at each of its ends (trapezoidal rule), and is carried to the end of the window.
     """
-    A = carriers(pieces)
+    A = carriers(motion_matrices(pieces))
     sizes = np.stack([ways(pieces), angles(pieces)], axis=1)  # (W, 2, P)
     share = np.zeros((*sizes.shape[:2], sizes.shape[2] + 1))
     share[..., :-1] += 0.5 * sizes
@@ -588,15 +592,13 @@ def fit_terms(
     F : (W, p, n, n)
     floor : (n,), variances that are there in any case
     """
-    theta = np.maximum(start, 1e-12 * start.max()) if start is not None else _start(error, F)
+    if start is not None:
+        theta = np.maximum(start, 1e-12 * start.max())
+    else:  # the mean square of each axis, divided evenly among its terms
+        term = np.arange(F.shape[1])
+        axis = term % error.shape[1]
+        own = F.mean(axis=0)[term, axis, axis]
+        theta = mean_square(error)[axis] / (2 * np.where(own > 0, own, np.inf)) + 1e-30
     return maximise(
         lambda variances: score_of(error, sum_of_terms(variances, F, floor), F), theta, 0.0, CLOSE * len(error)
     )
-
-
-def _start(error: Array, F: Array) -> Array:
-    """The mean square of each axis, divided evenly among its terms."""
-    axis = np.arange(F.shape[1]) % error.shape[1]
-    own = F.mean(axis=0)[np.arange(F.shape[1]), axis, axis]
-    square = mean_square(error)[axis]
-    return np.asarray(square / (2 * np.where(own > 0, own, np.inf)) + 1e-30)

@@ -68,7 +68,7 @@ from consistency.referee.fit_covariance.refusals import (
 )
 from consistency.referee.geometry import log, matrices
 from consistency.referee.readers.truth_matching import Poses
-from consistency.referee.show.blocks import Block, Cell, Column, Document, Quantity, Table, Text, table
+from consistency.referee.show.blocks import Block, Cell, Column, Document, Quantity, Text, table
 from consistency.referee.types import Array
 
 SPANS = (1, 2, 5, 10, 20)  # multiples of the span that the fit is judged at
@@ -167,7 +167,6 @@ class NoiseModel:
         return plotted(partial(draw_noise, self), path)
 
     def __repr__(self) -> str:
-
         return f"<NoiseModel {self.name}: {model_sentence(self)}>"
 
 
@@ -346,22 +345,19 @@ def model_sentence(model: NoiseModel) -> str:
     word = model.status
     if word == "consistent":
         word = f"consistent within x{DETECT:g}"
-    parts = [f"at {_text(model.span)} {word}: held-out ratio {shown(model.ratio)}", _basis(model), *_reasons(model)]
+    judged, windows = model.ratio.drives, plural(model.ratio.windows, "window")
+    basis = f"fitted on {plural(len(model.fitted_drives), 'drive')}, judged on {judged} ({windows})"
+    if model.held_out == HALF:
+        halves = "half" if judged == 1 else "halves"
+        basis = f"fitted on the first {halves} of {plural(judged, 'drive')}, judged on the second ({windows})"
+    elif model.held_out == IN_TURN:
+        basis = f"{plural(judged, 'drive')}, each judged by the fit of the others ({windows})"
+    parts = [f"at {_text(model.span)} {word}: held-out ratio {shown(model.ratio)}", basis, *_reasons(model)]
     return "; ".join(parts)
 
 
 def _text(span: str) -> str:
     return span_of(span).text
-
-
-def _basis(model: NoiseModel) -> str:
-    judged, windows = model.ratio.drives, plural(model.ratio.windows, "window")
-    if model.held_out == HALF:
-        halves = "half" if judged == 1 else "halves"
-        return f"fitted on the first {halves} of {plural(judged, 'drive')}, judged on the second ({windows})"
-    if model.held_out == IN_TURN:
-        return f"{plural(judged, 'drive')}, each judged by the fit of the others ({windows})"
-    return f"fitted on {plural(len(model.fitted_drives), 'drive')}, judged on {judged} ({windows})"
 
 
 def _reasons(model: NoiseModel) -> Iterator[str]:
@@ -419,10 +415,20 @@ def _unit(axis: str) -> str:
 
 def noise_document(model: NoiseModel) -> Document:
     """Sentence, corrections, table over axes and spans, and limits; numbers as data."""
+    numbers = [Column(head, number=True) for head in ("per m^.5", "per rad^.5", "at least")]
+    first, *longer = (_text(each.span) for each in model.spans)
+    columns = (Column("axis"), *numbers, Column(f"held-out {first}"), *map(Column, longer))
+    rows: list[tuple[Cell, ...]] = []
+    for i, axis in enumerate(model.noise.axes):
+        variances = model.per_m[i].value, model.per_rad[i].value, model.noise.floor[i]
+        sigmas = [f"{np.sqrt(value):.2g} {_unit(axis)}" for value in variances]
+        rows.append((axis, *sigmas, *(_cell(each.axes[i]) for each in model.spans)))
+    rows.append(("all", "", "", "", *(_cell(each.whole) for each in model.spans)))
+    label = "Noise of each axis, and ratios of true to stated covariance over spans"
     opening: list[Block] = [Text(f"{model.name}: {model_sentence(model)}")]
     if corrected := correction(model):
         opening.append(Text(corrected))
-    opening.append(_table(model))
+    opening.append(table(columns, rows, label, style="plain"))
     opening += map(Text, noise_lines(model))
     return Document(
         f"{model.name}: noise of motions over {_text(model.span)}", "", (), tuple(opening), data_of_model(model)
@@ -465,29 +471,12 @@ def _of_mean(fit: MeanFit) -> Iterator[str]:
             found += "; the true side errs, too, as of slip, or of a truth that drifts or jitters: --second tells which"
         yield found
     elif fit.is_open:
-        yield f"whose noise it is cannot be told: the scale of turns is {sides}; {_why_open(fit)}"
-
-
-def _why_open(fit: MeanFit) -> str:
-    if fit.strength < STRONG:
-        return f"neighbouring windows are weak instruments (F {short(fit.strength)}, below {STRONG:g})"
-    if fit.lasts:
-        return "errors outlast a window, so that neighbouring windows are not instruments"
-    return "neighbouring windows tell less than these"
-
-
-def _table(model: NoiseModel) -> Table:
-    numbers = [Column(head, number=True) for head in ("per m^.5", "per rad^.5", "at least")]
-    first, *longer = (_text(each.span) for each in model.spans)
-    columns = (Column("axis"), *numbers, Column(f"held-out {first}"), *map(Column, longer))
-    rows: list[tuple[Cell, ...]] = []
-    for i, axis in enumerate(model.noise.axes):
-        variances = model.per_m[i].value, model.per_rad[i].value, model.noise.floor[i]
-        sigmas = [f"{np.sqrt(value):.2g} {_unit(axis)}" for value in variances]
-        rows.append((axis, *sigmas, *(_cell(each.axes[i]) for each in model.spans)))
-    rows.append(("all", "", "", "", *(_cell(each.whole) for each in model.spans)))
-    label = "Noise of each axis, and ratios of true to stated covariance over spans"
-    return table(columns, rows, label, style="plain")
+        why = "neighbouring windows tell less than these"
+        if fit.strength < STRONG:
+            why = f"neighbouring windows are weak instruments (F {short(fit.strength)}, below {STRONG:g})"
+        elif fit.lasts:
+            why = "errors outlast a window, so that neighbouring windows are not instruments"
+        yield f"whose noise it is cannot be told: the scale of turns is {sides}; {why}"
 
 
 def _cell(ratio: Ratio) -> Cell:
@@ -498,36 +487,30 @@ def _cell(ratio: Ratio) -> Cell:
 
 def noise_lines(model: NoiseModel) -> Iterator[str]:
     """Limits of the model, what was left out, and what the referee says of the judged motions."""
-    yield "; ".join(_limits_of_use(model))
+    unshown = [each.span for each in model.spans[1:] if each.whole.status != "consistent"]
+    limits = [f"not shown for {_text(unshown[0])} and more" if unshown else f"shown for {_text(model.span)} alone"]
+    new_drive = "not known from one"
+    if np.isfinite(model.ratio.spread):
+        low, high = model.ratio.reach
+        new_drive = f"{low:.2g} to {high:.2g}"
+    limits += [f"a new drive: {new_drive}", f"jumps cut: {model.counts['jumps']}"]
+    for key, why in (("still", "without motion"), ("long", "with rows or truth missing")):
+        if number := model.counts[key]:
+            limits.append(f"left out {why}: {number}")
+    yield "; ".join(limits)
     if model.noise.factor != 1.0:
         yield f"cautious: all covariances are raised x{model.noise.factor:.3g}, so that a new drive rarely has more"
     if shift := model.drives[0].shift:
         yield (f"clocks: {shift:.3g} s are added to the timestamps of the estimates, for which the motions agree best")
     if model.second is not None:
-        yield _of_second(model)
+        yield _of_second(model.second, model.noise.axes)
     if model.noise.mean_fit is not None:
         yield from _of_mean(model.noise.mean_fit)
     yield from model.warnings
     yield f"analyse counts each judged motion as a run, though those of a drive depend: {model.verdict.reasons[0]}"
 
 
-def _limits_of_use(model: NoiseModel) -> Iterator[str]:
-    unshown = [each.span for each in model.spans[1:] if each.whole.status != "consistent"]
-    yield f"not shown for {_text(unshown[0])} and more" if unshown else f"shown for {_text(model.span)} alone"
-    if np.isfinite(model.ratio.spread):
-        low, high = model.ratio.reach
-        yield f"a new drive: {low:.2g} to {high:.2g}"
-    else:
-        yield "a new drive: not known from one"
-    yield f"jumps cut: {model.counts['jumps']}"
-    for key, why in (("still", "without motion"), ("long", "with rows or truth missing")):
-        if number := model.counts[key]:
-            yield f"left out {why}: {number}"
-
-
-def _of_second(model: NoiseModel) -> str:
-    second, axes = model.second, model.noise.axes
-    assert second is not None
+def _of_second(second: SecondErrors, axes: Sequence[str]) -> str:
     shown = ", ".join(f"{axis} {each:.2f}" for axis, each in zip(axes, second.correlation, strict=True))
     found = f"correlation with errors of the second estimator: {shown}; above {SHARED:g} they are the truth's"
     if second.is_rough.any():

@@ -51,7 +51,12 @@ def draw_noise(model: Any) -> Drawing:
     growth, turns, drives = panels[-3:]
     _draw_growth(growth, model, axes[:d], "m²")
     _draw_growth(turns, model, axes[d:], "rad²")
-    _draw_drives(drives, model)
+    ratios = model.spans[0].by_drive[:, 0]
+    known = np.flatnonzero(np.isfinite(ratios))
+    draw_ratios(drives, [model.drives[i].name for i in known], ratios[known])
+    drives.axvline(model.ratio.value, **stroke(LIMIT))
+    most = 1.1 * float(ratios[known].max())
+    drives.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, most)))
     return add_legend(figure)
 
 
@@ -87,16 +92,6 @@ def _draw_growth(
     log_axis(panel, "y")
 
 
-def _draw_drives(axes: Axes, model: Any) -> None:
-    """Ratio of true to stated covariance, a row for each drive."""
-    ratios = model.spans[0].by_drive[:, 0]
-    known = np.flatnonzero(np.isfinite(ratios))
-    draw_ratios(axes, [model.drives[i].name for i in known], ratios[known])
-    axes.axvline(model.ratio.value, **stroke(LIMIT))
-    most = 1.1 * float(ratios[known].max())
-    axes.set(title=f"ratios over {span_of(model.span).text}", xlim=(0.0, max(2.0, most)))
-
-
 def draw_ratios(axes: Axes, names: Sequence[str], *ratios: Array) -> None:
     """Ratios of true to stated covariance, a row for each name, beside those that count as consistent."""
     name_rows(axes, names)
@@ -116,7 +111,11 @@ def draw_correction(found: Any) -> Drawing:
     draw_ratios(runs, np.array(found.judged)[rows], *(each[rows] for each in ratios))
     log_axis(runs, "x")
     _draw_factors(factors, found)
-    _draw_coverage(coverage, found)
+    levels = np.linspace(0.01, 0.99, 50)
+    coverage.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
+    curve(coverage, levels, found.before.covered(levels), solid(style(0)), "stated")
+    curve(coverage, levels, found.after.covered(levels), solid(style(1)), "corrected")
+    coverage.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")
     return add_legend(figure)
 
 
@@ -132,12 +131,3 @@ def _draw_factors(axes: Axes, found: Any) -> None:
     intervals(axes, np.arange(len(names), dtype=float), values, style(1))
     log_axis(axes, "x")
     axes.set(xlabel="factor on variances")
-
-
-def _draw_coverage(axes: Axes, found: Any) -> None:
-    """Share of held-out errors inside the ellipsoid of each probability."""
-    levels = np.linspace(0.01, 0.99, 50)
-    axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED))
-    curve(axes, levels, found.before.covered(levels), solid(style(0)), "stated")
-    curve(axes, levels, found.after.covered(levels), solid(style(1)), "corrected")
-    axes.set(xlabel="probability of the ellipsoid", ylabel="share of errors inside")

@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.whiteness import nis_of
 from consistency.referee.errors import InputError
 from consistency.referee.gating.session import Terms
 from consistency.referee.readers.formats.archives import steps_of
-from consistency.referee.readers.options import Reading, StatementOptions
+from consistency.referee.readers.options import make_reading
 from consistency.referee.readers.pipeline.arrays_in_memory import (
     in_memory,
     masked_steps,
@@ -72,7 +72,7 @@ def record_of_checked(
         raise ValueError(f"give {' or '.join(there)}, not both")
     key = there[0] if there else "covariances"
     size = sizes[key]
-    options = Reading(statement=StatementOptions(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble))
+    options = make_reading(level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble)
     if options.given(("level", "ends")) and bounds is None and not gaussian:
         raise ValueError("level and ends go with bounds")
     if errors is None and size is not None:
@@ -112,10 +112,7 @@ def record_of_checked(
             "the stated size, even if the filter is right"
         )
     record = _ended(replace(record, innovations=replace(of_gain, optimal_gain=optimal_gain)), failures)
-    try:
-        return record.without_first(skip_of(skip))
-    except InputError as error:
-        raise ValueError(str(error).removeprefix("--")) from None
+    return _without_first(record, skip)
 
 
 def planned_runs(record: Record, terms: Terms | Settings, rate: float) -> int:
@@ -191,12 +188,17 @@ def record_of_read(
     ValueError
         ``skip`` leaves nothing.
     """
-    try:
-        record = rows_as_declared(record).without_first(skip_of(skip))
-    except InputError as error:
-        raise ValueError(str(error).removeprefix("--")) from None
+    record = _without_first(rows_as_declared(record), skip)
     record = record.with_optimal_gain() if optimal_gain else record
     return replace(record, name=name or record.name)
+
+
+def _without_first(record: Record, skip: str | float | Skip | None) -> Record:
+    """The record without its first steps; a ValueError names the argument, not the flag of a command."""
+    try:
+        return record.without_first(skip_of(skip))
+    except InputError as error:
+        raise ValueError(str(error).removeprefix("--")) from None
 
 
 # --- arrays ----------------------------------------------------------------------------------------

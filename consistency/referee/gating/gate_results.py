@@ -147,28 +147,21 @@ def _cells(e: Entry) -> dict[str, Cell]:
     first, *rest = e.reasons
     value, *ends = e.axis_ratio or (e.inflation, *(e.inflation_interval or (None, None)))
     low, high = (float("inf") if end is None else end for end in ends)
-    axis = ""
+    axis, p = "", "-"
     page = [f"page: {e.page}"] * is_shown(e)
     if e.axis:
         axis = f" in {e.axis}"
+    if e.p_value is not None:
+        p = f"{min(e.p_value, 1.0):.2g}"
+        if e.p_value < 1e-6:
+            p = "<1e-6"
     return {
         "test": e.test, "gate": e.gate, "filter": e.name, "outcome": outcome_text(e), "verdict": Status(e.status),
-        "p": _p_text(e.p_value), "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs),
-        "planned": str(e.needed),
-        "true / stated": Quantity(
-            value, (low, high), axis, digits=".3g", is_factor=True
-        ),
+        "p": p, "false-alarm rate": f"{e.false_alarm:.3g}", "runs": str(e.runs), "planned": str(e.needed),
+        "true / stated": Quantity(value, (low, high), axis, digits=".3g", is_factor=True),
         "why": Reason(f"{e.gate} {e.name}", first, (*rest, *page), None, e.outcome == "passed" or wanted(e), e.test),
         "": Reason(e.name, first, has_passed=e.outcome != "fault found"),
     }  # fmt: skip
-
-
-def _p_text(p: float | None) -> str:
-    if p is None:
-        return "-"
-    if p < 1e-6:
-        return "<1e-6"
-    return f"{min(p, 1.0):.2g}"
 
 
 def _table(entries: Iterable[Entry], heads: tuple[str, ...]) -> Table:

@@ -23,19 +23,7 @@ from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.errors import InputError, naming_arguments
 from consistency.referee.extras import explained_import
 from consistency.referee.readers.formats.members import UNWEIGHTED
-from consistency.referee.readers.options import (
-    OPTIONS,
-    ComponentOptions,
-    ConventionOptions,
-    GroupOptions,
-    MatchingOptions,
-    Reading,
-    RunOptions,
-    SourceOptions,
-    StatementOptions,
-    TruthOptions,
-    make_reading,
-)
+from consistency.referee.readers.options import OPTIONS, make_reading
 from consistency.referee.readers.pipeline.arrays_in_memory import record_of_statement
 from consistency.referee.readers.pipeline.by_column import with_groups
 from consistency.referee.readers.pipeline.read_files import checked_options, read_frames, read_recordings
@@ -154,27 +142,16 @@ def read(
     true = None if truth is None or in_memory else Path(truth)
     stated = None if covariance is None else Path(covariance)
     of_truth = None if truth_covariance is None else str(truth_covariance)
-    reading = Reading(
-        sources=SourceOptions(truth=true, covariance=stated, topic=topic, truth_topic=truth_topic, body=body),
-        conventions=ConventionOptions(
-            error=error, covariance_order=covariance_order,
-            world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes,
-        ),
-        components=ComponentOptions(
-            state=state, axes=axes, columns=columns, truth_columns=truth_columns, members=members
-        ),
-        matching=MatchingOptions(max_dt=max_dt, time_offset=time_offset, align=align, lever_arm=lever_arm),
-        runs=RunOptions(
-            relative=relative, motions=motions or None, windows=windows, independent=independent or None, split=split
-        ),
-        truth=TruthOptions(
-            truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None
-        ),
-        statement=StatementOptions(
-            level=level, gaussian=gaussian or None, ends=ends, dof=dof, ensemble=ensemble,
-            alert_limit=alert_limit,
-        ),
-        groups=GroupOptions(by=by, by_file=None if by_file is None else Path(by_file), bins=bins),
+    reading = make_reading(
+        truth=true, covariance=stated, topic=topic, truth_topic=truth_topic, body=body,
+        error=error, covariance_order=covariance_order,
+        world=world, body_axes=body_axes, truth_world=truth_world, truth_body_axes=truth_body_axes,
+        state=state, axes=axes, columns=columns, truth_columns=truth_columns, members=members,
+        max_dt=max_dt, time_offset=time_offset, align=align, lever_arm=lever_arm,
+        relative=relative, motions=motions or None, windows=windows, independent=independent or None, split=split,
+        truth_covariance=of_truth, truth_errors=truth_errors, truth_shared=truth_shared or None,
+        level=level, gaussian=gaussian or None, ends=ends, dof=dof, ensemble=ensemble, alert_limit=alert_limit,
+        by=by, by_file=None if by_file is None else Path(by_file), bins=bins,
     )  # fmt: skip
     found = read_frames(estimates, truth, reading) if in_memory else read_recordings(Path(estimates), reading)
     where = "estimates" if in_memory else estimates
@@ -294,10 +271,9 @@ def judge(
         raise InputError(f"{', '.join(stated)}: give one of them beside errors")
     if "weights" in settings:
         raise InputError(f"weights: {UNWEIGHTED}")
-    statement = StatementOptions(
+    options = make_reading(
         level=level, gaussian=gaussian or None, ends=ends, ensemble=ensemble, alert_limit=alert_limit
     )
-    options = Reading(statement=statement)
     if bounds is not None or options.given(("level", "gaussian", "ends", "alert_limit")):
         options = checked_options(options)
     if stated or members is not None or truth is not None:
@@ -305,7 +281,7 @@ def judge(
         errors = cast("ArrayLike | None", record)
         record = record_of_statement(errors, stated | of_truth, members, truth, axes, name, independent, options)
         if truth is None:
-            options = Reading(truth=TruthOptions(truth_errors=truth_errors, truth_shared=truth_shared or None))
+            options = make_reading(truth_errors=truth_errors, truth_shared=truth_shared or None)
             require_truth_options(options)
             (record,) = declared([record], options)
     elif isinstance(record, (str, Path)):

@@ -6,7 +6,7 @@ freedom, or the test ratios of a sensor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -97,18 +97,13 @@ def by_axis(study: Judged) -> tuple[Block, ...]:
             axes.set_yticklabels([])
         return add_legend(figure)
 
-    return Figure("By axis", axis_caption(study, found), (draw,), level=4), *_in_numbers(study, found)
-
-
-def _in_numbers(study: Judged, found: tuple[Forest, ...]) -> tuple[Details, ...]:
-    """The covariance ratios of the figure, as a table to unfold."""
-    ratios = [forest for forest in found if forest.name == "ratio"]
-    if not ratios:
-        return ()
-    columns = (Column("Axis"), *(Column(track.name, number=True) for track in study.tracks))
-    rows: list[tuple[Cell, ...]] = [(name, *map(_quantity, intervals)) for name, intervals in ratios[0].rows]
-    shown = table(columns, rows, f"Covariance ratio by axis of {study.name}")
-    return (Details("Covariance ratio by axis, in numbers", (shown,)),)
+    blocks: list[Block] = [Figure("By axis", axis_caption(study, found), (draw,), level=4)]
+    if found[0].name == "ratio":
+        columns = (Column("Axis"), *(Column(track.name, number=True) for track in study.tracks))
+        rows: list[tuple[Cell, ...]] = [(name, *map(_quantity, intervals)) for name, intervals in found[0].rows]
+        shown = table(columns, rows, f"Covariance ratio by axis of {study.name}")
+        blocks.append(Details("Covariance ratio by axis, in numbers", (shown,)))
+    return tuple(blocks)
 
 
 def _quantity(interval: Interval | None) -> Quantity:
@@ -149,20 +144,17 @@ def forests(study: Judged) -> tuple[Forest, ...]:
     )
     result = []
     for name, label, expected, window, log, intervals_of in kinds:
-        rows = _rows(study, intervals_of)
+        known: list[Interval] = []
+        rows: dict[str, list[Interval | None]] = {}
+        for number, track in enumerate(study.tracks):
+            for axis, interval in intervals_of(track.verdict).items():
+                if np.isfinite(interval[0]):
+                    known.append(interval)
+                    rows.setdefault(axis, [None] * len(study.tracks))[number] = interval
         if rows:
-            known = [interval for _, row in rows for interval in row if interval is not None]
-            result.append(Forest(name, label, expected, window(known), log, rows))
+            of_axes = tuple((axis, tuple(row)) for axis, row in rows.items())
+            result.append(Forest(name, label, expected, window(known), log, of_axes))
     return tuple(result)
-
-
-def _rows(study: Judged, intervals_of: Callable[[Verdict], dict[str, Interval]]) -> tuple[Row, ...]:
-    rows: dict[str, list[Interval | None]] = {}
-    for number, track in enumerate(study.tracks):
-        for name, interval in intervals_of(track.verdict).items():
-            if np.isfinite(interval[0]):
-                rows.setdefault(name, [None] * len(study.tracks))[number] = interval
-    return tuple((name, tuple(row)) for name, row in rows.items())
 
 
 def _ratios(v: Verdict) -> dict[str, Interval]:
@@ -244,7 +236,15 @@ def ratio_by_group_figure(verdict: Verdict) -> tuple[Figure, ...]:
             axes.set_yticklabels([])
         return add_legend(figure)
 
-    return (Figure(f"By {first.column}", _caption(of_parts), (draw,)),)
+    caption = (
+        f"Ratio of true to stated covariance in each group by {first.column}: 1 is right (line), above is "
+        "overconfident; log axis. Bars: 95 % intervals for all groups at once, from the run means of their steps. "
+    )
+    if first.outcome:
+        caption += f"{first.column} {first.outcome}, which selects on the outcome: groups show, they do not convict."
+    else:
+        caption += "The questions decide, not the bars."
+    return (Figure(f"By {first.column}", caption, (draw,)),)
 
 
 def _draw_groups(axes: Axes, by: ByGroup, labels: tuple[str, ...], factor: float) -> None:
@@ -267,18 +267,6 @@ def _look(status: str) -> Look:
     """At fault, shown to be right, or neither."""
     looks = {"consistent": ACCEPTED, "conservative": LOW} | {side: REJECTED for side in SIDES if side != "conservative"}
     return replace(looks.get(status, OPEN), size=3.2, width=1.1)
-
-
-def _caption(of_parts: Mapping[str, ByGroup]) -> str:
-    """What the rows show, and what they do not."""
-    first = next(iter(of_parts.values()))
-    text = (
-        f"Ratio of true to stated covariance in each group by {first.column}: 1 is right (line), above is "
-        "overconfident; log axis. Bars: 95 % intervals for all groups at once, from the run means of their steps. "
-    )
-    if first.outcome:
-        return f"{text}{first.column} {first.outcome}, which selects on the outcome: groups show, they do not convict."
-    return f"{text}The questions decide, not the bars."
 
 
 def bound_figures(verdict: Verdict) -> tuple[Figure, ...]:
@@ -334,18 +322,13 @@ def monitor_drawing(shown: Watched | Sequence[GateRatios]) -> Drawing:
     figure, panels = canvas(HEIGHT * len(shown) / 2.0, panels=len(shown), sharex=True)
     start = min((float(each.t[0]) for each in shown if len(each.t)), default=0.0)
     for axes, each in zip(panels, shown, strict=True):
-        _draw_ratios(axes, each, start)
+        points(axes, each.t - start, each.ratio, EACH_STEP, "test ratio", limit=LONG)
+        for at, look, label in ((1.0, LIMIT, "gate"), (each.unusual, EXPECTED, "rarely exceeded by a right filter")):
+            if np.isfinite(at):
+                axes.axhline(at, **stroke(look), label=label)
+        axes.set(ylabel="test ratio", title=each.sensor)
     panels[-1].set_xlabel(FROM_START)
     return add_legend(figure)
-
-
-def _draw_ratios(axes: Axes, each: GateRatios, start: float) -> None:
-    """Test ratios of a sensor over time, the gate, and what a right filter rarely exceeds."""
-    points(axes, each.t - start, each.ratio, EACH_STEP, "test ratio", limit=LONG)
-    for at, look, label in ((1.0, LIMIT, "gate"), (each.unusual, EXPECTED, "rarely exceeded by a right filter")):
-        if np.isfinite(at):
-            axes.axhline(at, **stroke(look), label=label)
-    axes.set(ylabel="test ratio", title=each.sensor)
 
 
 def _draw_sizes(axes: Axes, watched: Watched) -> None:

@@ -166,6 +166,12 @@ def _span_runs(axes: Axes, record: Record) -> None:
     axes.set(xlabel=record.runs.unit, xlim=(record.run_numbers.min() - 0.5, record.run_numbers.max() + 0.5))
 
 
+def _log_if_wide(axes: Axes, *values: Array) -> None:
+    """A log axis of values that span more than a decade."""
+    if wide(list(values)):
+        log_axis(axes, "y")
+
+
 # --- errors -----------------------------------------------------------------------------------------
 
 
@@ -240,14 +246,18 @@ def _errors_of_runs(record: Record, of: Errors) -> Paint:
     return paint
 
 
-def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
-    others = np.linspace(0, len(of.error) - 1, MOST_RUNS + 1).astype(int)
+def _draw_others(axes: Axes, clock: Clock, values: Array, row: int) -> None:
+    """Some of the runs (R, T) but the one in this row."""
+    others = np.linspace(0, len(values) - 1, MOST_RUNS + 1).astype(int)
+    label = "other runs"
+    for other in dict.fromkeys(others[others != row]):
+        curve(axes, clock.values, values[other], OTHERS, label)
+        label = ""
 
+
+def _error_curves(record: Record, clock: Clock, row: int, of: Errors) -> Paint:
     def paint(axes: Axes) -> None:
-        label = "other runs"
-        for other in dict.fromkeys(others[others != row]):
-            curve(axes, clock.values, of.error[other], OTHERS, label)
-            label = ""
+        _draw_others(axes, clock, of.error, row)
         axes.axhline(0.0, **stroke(ZERO))
         draw_bounded(axes, clock.values, of.error[row], of.bound[row], f"run {record.run_numbers[row]}")
         settled = slice(len(record.runs.t) // 10, None)  # at the start errors and bounds may be larger by far
@@ -277,14 +287,10 @@ def _scaled_curves(record: Record, clock: Clock, row: int, axis: int) -> Paint:
     sigma = np.sqrt(np.maximum(record.errors.covariance[:, :, axis, axis], 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         scaled = record.errors.error[..., axis] / sigma
-    others = np.linspace(0, len(scaled) - 1, MOST_RUNS + 1).astype(int)
 
     def paint(axes: Axes) -> None:
         axes.axhspan(-SIGMAS, SIGMAS, color=INSIDE, linewidth=0, zorder=0.4, label="2 sigma")
-        label = "other runs"
-        for other in dict.fromkeys(others[others != row]):
-            curve(axes, clock.values, scaled[other], OTHERS, label)
-            label = ""
+        _draw_others(axes, clock, scaled, row)
         axes.axhline(0.0, **stroke(ZERO))
         curve(axes, clock.values, scaled[row], SHOWN, f"run {record.run_numbers[row]}")
         reach = max(LEAST_REACH, 1.1 * _most(scaled))
@@ -314,7 +320,6 @@ def _bounded(record: Record) -> Picture | None:
     if ratios is None:
         return None
     clock, row = time_axis_of(record.runs.t), shown_run(record)
-    others = np.linspace(0, len(ratios) - 1, MOST_RUNS + 1).astype(int)
 
     def panel(number: int) -> Paint:
         def paint(axes: Axes) -> None:
@@ -326,10 +331,7 @@ def _bounded(record: Record) -> Picture | None:
                 points(axes, record.run_numbers.astype(float), of[:, 0], EACH_RUN, f"error of a {record.runs.unit}")
                 _span_runs(axes, record)
                 return
-            label = "other runs"
-            for other in dict.fromkeys(others[others != row]):
-                curve(axes, clock.values, of[other], OTHERS, label)
-                label = ""
+            _draw_others(axes, clock, of, row)
             curve(axes, clock.values, of[row], SHOWN, f"run {record.run_numbers[row]}")
             clock.name(axes)
 
@@ -379,8 +381,7 @@ def _nees(record: Record, verdict: Verdict) -> Picture | None:
         curve(axes, clock.values, scale.anees, SHOWN, record.name)
         axes.set_ylabel("NEES")
         clock.name(axes)
-        if wide(drawn):
-            log_axis(axes, "y")
+        _log_if_wide(axes, *drawn)
 
     caption = (
         f"{name}; {scale.dof} is expected (line). Above is overconfident, below conservative. Shaded: 95 % of "
@@ -408,24 +409,27 @@ def _worst_run(record: Record) -> Picture | None:
         points(axes, np.array([float(number)]), means[[worst]], WORST, f"run {number}")
         axes.set_ylabel("mean NEES")
         _span_runs(axes, record)
-        if wide([means]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, means)
 
     def paint_worst(axes: Axes) -> None:
-        ends = [float(distributions.chi2.ppf(q, record.errors.dof)) for q in (0.025, 0.975)]
-        axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5)
+        _draw_band(axes, record.errors.dof)
         axes.axhline(float(record.errors.dof), **stroke(EXPECTED))
         curve(axes, clock.values, nees[worst], WORST, "")
         axes.set_ylabel(f"NEES of run {number}")
         clock.name(axes)
-        if wide([nees[worst]]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, nees[worst])
 
     caption = (
         f"Mean NEES of each run, and the NEES of run {number}, which has the largest; {record.errors.dof} is expected "
         f"in the mean (lines). Shaded: where 95 % of the steps of a right estimator lie.{clock.note}"
     )
     return Picture("Which run, and when", caption, (paint_runs, paint_worst), height=1.6, is_shared=False)
+
+
+def _draw_band(axes: Axes, dof: int, label: str = "") -> None:
+    """Where 95 % of the NEES of a right estimator lie."""
+    ends = distributions.chi2.ppf(np.array([0.025, 0.975]), dof)
+    axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5, label=label)
 
 
 def _single_nees(record: Record) -> Picture | None:
@@ -442,8 +446,7 @@ def _single_nees(record: Record) -> Picture | None:
         x, rows = record.run_numbers.astype(float), nees[:, :1].T
         if record.runs.independent:
             x, rows = time_axis_of(record.runs.t).values, nees
-        ends = [float(distributions.chi2.ppf(q, record.errors.dof)) for q in (0.025, 0.975)]
-        axes.axhspan(*ends, color=BAND, linewidth=0, zorder=0.5, label=f"95 % band of {each}")
+        _draw_band(axes, record.errors.dof, f"95 % band of {each}")
         axes.axhline(float(record.errors.dof), **stroke(EXPECTED), label="expected")
         label = f"NEES of {each.replace('one', 'a')}"
         for values in rows:
@@ -454,8 +457,7 @@ def _single_nees(record: Record) -> Picture | None:
             time_axis_of(record.runs.t).name(axes)
         else:
             _span_runs(axes, record)
-        if wide([nees]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, nees)
 
     plural_of = "windows" if record.runs.independent else f"{record.runs.unit}s"
     caption = (
@@ -563,8 +565,7 @@ def _innovations(record: Record, verdict: Verdict) -> Picture | None:
         points(axes, clock.values, ratio, EACH_RUN)
         axes.set_ylabel("NIS / dof")
         clock.name(axes)
-        if wide([ratio]):
-            log_axis(axes, "y")
+        _log_if_wide(axes, ratio)
 
     judged = verdict.innovations is not None and verdict.innovations.judged
     caption = (

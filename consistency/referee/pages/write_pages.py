@@ -22,17 +22,23 @@ from consistency.referee.pages import verdicts
 from consistency.referee.pages.ratio_figures import bound_figures, by_axis, ratio_by_group_figure
 from consistency.referee.pages.record_figures import OVER_SIGMA, record_figures
 from consistency.referee.pages.verdicts import Estimator, Judged, time_axis_of
-from consistency.referee.show import FORMATS, rendered
+from consistency.referee.show import FORMATS, as_html, rendered
 from consistency.referee.show.blocks import Block, Chapter, Details, Document, Facts, Text, badges, number
-from consistency.referee.system import write_whole
+from consistency.referee.system import (
+    Advance,
+    command_line,
+    manifest_of,
+    read_manifest,
+    require_free,
+    write_folder,
+    write_whole,
+)
 from consistency.referee.verdicts.tables import region_tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from matplotlib.figure import Figure as Drawing
-
-    from consistency.referee.system import Advance
 
 REPORT_FILES = ("report.html", "report.pdf", "verdict.json")
 MARK = "<!-- written by consistency analyse, which replaces it -->\n"  # the end of a file of a verdict
@@ -58,8 +64,6 @@ def write_file_pages(
     records: Sequence[Record], judged: Mapping[str, Verdict], html: Path | None, pdf: Path | None, title: str
 ) -> None:
     """Report of files of another estimator, as :func:`write_file_reports` writes it; None leaves a file out."""
-    from consistency.referee.system import manifest_of
-
     write_document(compose_files(records, judged, title, manifest_of(kind="verdict", source=title)), html, pdf)
 
 
@@ -85,8 +89,6 @@ def write_file_reports(
     InputError
         The folder exists or cannot be written.
     """
-    from consistency.referee.system import manifest_of, write_folder
-
     manifest = manifest_of(kind="verdict", source=title)
     document = compose_files(records, judged, title, manifest)
 
@@ -106,8 +108,6 @@ def write_text_file(document: Document, path: Path) -> Path:
     InputError
         The file cannot be written.
     """
-    from consistency.referee.system import command_line
-
     write_file(path, f"{rendered(replace(document, command=command_line()), path)}{MARK}".encode())
     return path
 
@@ -121,13 +121,10 @@ def require_report(report: Path, overwrite: bool) -> bool:
         Something other than a report of a verdict is there, without ``overwrite``; the name is of a page or of JSON,
         which a folder has; or the system refuses.
     """
-    from consistency.referee.system import require_free
-
     if report.suffix.lower() in (".html", ".pdf", ".json") and not report.is_dir():
         raise InputError(
             f"{report}: a report is a folder, which has the page, the PDF and the JSON, or FILE.xml, FILE.md"
         )
-
     replaces = overwrite or is_own_report(report)
     if is_one_file(report):
         require_writable(report, replaces)
@@ -143,8 +140,6 @@ def is_one_file(report: Path) -> bool:
 
 def is_own_report(path: Path) -> bool:
     """Whether a folder or a file was written by ``analyse --report``, so that the next one replaces it."""
-    from consistency.referee.system import read_manifest
-
     try:
         if path.is_dir():
             others = {each.name for each in path.iterdir()} - {"manifest.json", *REPORT_FILES}
@@ -158,7 +153,6 @@ def write_document(
     document: Document, html: Path | None, pdf: Path | None, *, advance: Advance = lambda _: None
 ) -> None:
     """The document in both formats, each file whole or not at all; None leaves one out."""
-    from consistency.referee.show import as_html
     from consistency.referee.show.figures import paint
 
     contents: list[tuple[Path, bytes]] = []
@@ -235,7 +229,10 @@ def compose_files(
 ) -> Document:
     """The document that HTML and PDF show; a chapter for each of the records that has a verdict."""
     named = {record.name: record for record in records}
-    study = _study(tuple(judged.values()), title)
+    tracks = tuple(Estimator(v.filter, i, f"0-{i}", v, v.failures) for i, v in enumerate(judged.values()))
+    runs, steps = max(v.runs for v in judged.values()), max(v.steps for v in judged.values())
+    clock = time_axis_of(np.full(steps, np.nan))
+    study = Judged(title, "", runs, 0, clock, np.arange(1, steps + 1), tracks, until_decided=False)
     several = len(judged) > 1
     chapters = []
     for i, (name, verdict) in enumerate(judged.items()):
@@ -275,12 +272,6 @@ def note_sentence(note: str) -> str:
 
 def _ended(sentence: str) -> str:
     return sentence if sentence.endswith((".", "?")) else f"{sentence}."
-
-
-def _study(judged: tuple[Verdict, ...], title: str) -> Judged:
-    tracks = tuple(Estimator(v.filter, i, f"0-{i}", v, v.failures) for i, v in enumerate(judged))
-    runs, steps = max(v.runs for v in judged), max(v.steps for v in judged)
-    return Judged(title, "", runs, 0, time_axis_of(np.full(steps, np.nan)), np.arange(1, steps + 1), tracks, False)
 
 
 def _counts(record: Record, verdict: Verdict) -> str:

@@ -23,7 +23,7 @@ from pathlib import Path
 from consistency.referee.errors import InputError
 from consistency.referee.parsing import is_file, require_name
 from consistency.referee.readers.pipeline.program_runs import LOG, RUN_FILE, RUN_KIND, ProgramRun, filled
-from consistency.referee.system import AT_STOP, FULL, say
+from consistency.referee.system import AT_STOP, FULL, digest_of_file, say
 
 LARGEST_SEED = 2**31 - 1  # fits an int and std::stoi
 HALF = 2**16
@@ -74,7 +74,7 @@ class Program:
             for name in {word, word.rpartition("=")[2]}:  # by itself or behind an equals sign
                 path = (self.cwd or self.here) / filled(name, {"here": str(self.here)})
                 if path.is_file():
-                    found[str(path)] = _digest(path)
+                    found[str(path)] = digest_of_file(path).hex()
         return found
 
     def warn_of_relative_paths(self) -> None:
@@ -153,14 +153,6 @@ def _is_there(path: Path) -> bool:
         return False
 
 
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        for piece in iter(lambda: file.read(2**20), b""):
-            digest.update(piece)
-    return digest.hexdigest()
-
-
 def inputs_of(pattern: str, here: Path) -> list[Path]:
     """Recorded files or folders of ``--each``, absolute, by name.
 
@@ -189,13 +181,13 @@ class Processes:
         AT_STOP.append(self.stop)
         self._lock = threading.Lock()
         self._running: set[Process] = set()
-        self._is_stopped = False
+        self.is_stopped = False
 
     @contextmanager
     def started(self, words: list[str], cwd: Path, log: int, env: Mapping[str, str]) -> Iterator[Process]:
         """A process in a group of its own; at the end the whole group is killed."""
         with self._lock:
-            if self._is_stopped:
+            if self.is_stopped:
                 raise Stopped
             process = subprocess.Popen(
                 words, cwd=cwd, env=dict(env), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
@@ -210,10 +202,6 @@ class Processes:
             with self._lock:
                 self._running.discard(process)
 
-    @property
-    def is_stopped(self) -> bool:
-        return self._is_stopped
-
     def close(self) -> None:
         """Kill every run in progress, and start no other."""
         self.stop()
@@ -221,7 +209,7 @@ class Processes:
 
     def stop(self) -> None:
         with self._lock:
-            self._is_stopped = True
+            self.is_stopped = True
             for process in self._running:
                 _kill_group(process)
 
@@ -316,7 +304,10 @@ def _outcome(
     if is_late.is_set():
         return f"it was killed after {timeout:g} s (--timeout)"
     if status < 0:
-        return f"it was killed by {_signal_name(-status)}"
+        name = f"signal {-status}"
+        with suppress(ValueError):  # a number without a name
+            name = signal.Signals(-status).name
+        return f"it was killed by {name}"
     return f"it ended with status {status}" if status else ""
 
 
@@ -339,10 +330,3 @@ def _killed_after(timeout: float | None, process: Process) -> Iterator[threading
         yield is_late
     finally:
         timer.cancel()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

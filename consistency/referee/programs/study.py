@@ -396,7 +396,10 @@ class _Loop:
                 self._check_seed(stack)
             run = next(missing)
             while not self._is_decided:
-                while len(pending) < self._at_once(workers) and (self.total is None or run < self.total):
+                at_once = workers
+                if len(self.runs.found) < PROOF:  # the first ones are to show that the program works
+                    at_once = min(workers, PROOF)
+                while len(pending) < at_once and (self.total is None or run < self.total):
                     pending.add(pool.submit(self._done, run, new_folder(self.study.folder, run)))
                     run = next(missing)
                 if not pending:
@@ -408,10 +411,6 @@ class _Loop:
             self.processes.close()  # also runs beyond the one that decided
             pool.shutdown(cancel_futures=True)
 
-    def _at_once(self, workers: int) -> int:
-        """Runs at a time: few until the first ones have shown that the program works."""
-        return workers if len(self.runs.found) >= PROOF else min(workers, PROOF)
-
     @property
     def _is_decided(self) -> bool:
         return bool(self.names) and len(self.decided) == len(self.names)
@@ -419,17 +418,6 @@ class _Loop:
     def _done(self, run: int, folder: Path) -> ProgramRun:
         """Do a run, in a thread."""
         worker = self.idle.get()
-        try:
-            values = self._values(run, folder, worker)
-            return run_program(self.program, folder, run, values, self.plan.timeout, self.processes)
-        except Stopped:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-        finally:
-            self.idle.put(worker)
-
-    def _values(self, run: int, folder: Path, worker: int) -> dict[str, str]:
-        """What stands for each placeholder."""
         values = {
             "run": str(run), "seed": str(seed_of(self.plan.seed, run)), "out": str(folder),
             "here": str(self.program.here), "worker": str(worker),
@@ -437,7 +425,13 @@ class _Loop:
         if self.plan.inputs:
             path = self.plan.inputs[run]
             values |= {"input": str(path), "name": path.stem}
-        return values
+        try:
+            return run_program(self.program, folder, run, values, self.plan.timeout, self.processes)
+        except Stopped:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        finally:
+            self.idle.put(worker)
 
     # --- what a run says -----------------------------------------------------------------------------
 
@@ -455,7 +449,10 @@ class _Loop:
             raise self._all_failed()
         if len(self.runs.found) == PROOF and records:
             self._require_different()
-        self._look()
+        while self.next_look is not None and self.runs.first >= self.next_look:
+            runs = self.next_look
+            self.next_look = next(self.counts, None)
+            say(f"{runs} runs: {progress_text(self.decided, self.names)}")
 
     def _plan_runs(self, records: Sequence[Record], stack: ExitStack) -> None:
         """Plan the number of runs, or looks, from the dimension of the first run's errors."""
@@ -482,13 +479,6 @@ class _Loop:
         self.advance = stack.enter_context(progress("runs", self.total or planned))
         if self.total is None or len(self.logs) < self.total:
             self.advance(len(self.logs))
-
-    def _look(self) -> None:
-        """Look at the first runs, where as many are there as the next look takes."""
-        while self.next_look is not None and self.runs.first >= self.next_look:
-            runs = self.next_look
-            self.next_look = next(self.counts, None)
-            say(f"{runs} runs: {progress_text(self.decided, self.names)}")
 
     def _record(self, runs: int, name: str) -> Record:
         """Record of the first runs of an estimator."""

@@ -28,7 +28,6 @@ from consistency.referee.show.blocks import (
     Settings,
     Stack,
     Status,
-    Switch,
     Table,
     Text,
     unbroken,
@@ -109,11 +108,18 @@ class Page:
         if not chapter.title:
             return blocks
         summary = _paragraph(chapter.summary) if chapter.summary else ""
-        kind = ' class="study"' if chapter.switches else ""
+        kind = switches = ""
+        if chapter.switches:
+            boxes = "\n".join(
+                f'<label><input type="checkbox" checked autocomplete="off" data-filter="{escape(switch.tag)}">'
+                f"{_swatch(switch.look)} {escape(switch.text)}</label>"
+                for switch in chapter.switches
+            )
+            kind = ' class="study"'
+            switches = f'<fieldset class="switches"><legend>Filters shown in this study</legend>\n{boxes}\n</fieldset>'
         return (
             f'<section{kind} id="{anchor}" aria-labelledby="{anchor}-title">\n'
-            f'<h2 id="{anchor}-title">{escape(chapter.title)}</h2>\n{summary}{_switches(chapter.switches)}\n'
-            f"{blocks}\n</section>"
+            f'<h2 id="{anchor}-title">{escape(chapter.title)}</h2>\n{summary}{switches}\n{blocks}\n</section>'
         )
 
     def _block(self, block: Block) -> str:
@@ -151,18 +157,6 @@ class Page:
             f"<figure>\n<h{figure.level}>{title}</h{figure.level}>\n{charts}\n"
             f"<figcaption>{caption}</figcaption>\n</figure>"
         )
-
-
-def _switches(switches: Sequence[Switch]) -> str:
-    """A box to tick for each filter."""
-    if not switches:
-        return ""
-    boxes = "\n".join(
-        f'<label><input type="checkbox" checked autocomplete="off" data-filter="{escape(switch.tag)}">'
-        f"{_swatch(switch.look)} {escape(switch.text)}</label>"
-        for switch in switches
-    )
-    return f'<fieldset class="switches"><legend>Filters shown in this study</legend>\n{boxes}\n</fieldset>'
 
 
 def _swatch(look: Look) -> str:

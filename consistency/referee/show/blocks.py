@@ -316,20 +316,20 @@ def written(cell: Cell, signs: Signs = PRINTED) -> str:
         return f"{cell.mark} {cell.text}"
     if isinstance(cell, Status):
         return cell.text + cell.note
-    return _quantity(cell, signs) if isinstance(cell, Quantity) else cell.text
-
-
-def _quantity(q: Quantity, signs: Signs) -> str:
-    if q.is_empty or q.value is None:
+    if not isinstance(cell, Quantity):
+        return cell.text
+    if cell.is_empty or cell.value is None:
         return signs.none
-    text = f"{signs.factor * q.is_factor}{_digits(q.value, q.digits, signs)}{q.unit}"
-    if q.interval is not None:
-        low, high = q.interval
-        if np.isfinite(q.limit) and low > 1.0 and high >= q.limit * low:
-            return f"at least {signs.factor}{_digits(low, q.digits, signs)}{q.unit}"
-        known = np.isinf(q.limit) or high < q.limit * low
-        text += f" [{', '.join(_digits(end, q.digits, signs) for end in (low, high)) if known else 'unknown'}]"
-    return f"({text})" if q.is_aside else text
+    text = f"{signs.factor * cell.is_factor}{_digits(cell.value, cell.digits, signs)}{cell.unit}"
+    if cell.interval is not None:
+        low, high = cell.interval
+        if np.isfinite(cell.limit) and low > 1.0 and high >= cell.limit * low:
+            return f"at least {signs.factor}{_digits(low, cell.digits, signs)}{cell.unit}"
+        ends = "unknown"
+        if np.isinf(cell.limit) or high < cell.limit * low:
+            ends = f"{_digits(low, cell.digits, signs)}, {_digits(high, cell.digits, signs)}"
+        text += f" [{ends}]"
+    return f"({text})" if cell.is_aside else text
 
 
 def _digits(value: float, digits: str, signs: Signs) -> str:

@@ -13,7 +13,7 @@ import re
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from html import escape, unescape
 from importlib.util import find_spec
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.legend import Legend
 
 LIMIT = 300  # points of a line
 WIDTH = 5.0  # inches, the widest figure
@@ -247,12 +246,12 @@ def dodge(slot: int, slots: int) -> float:
 # --- axes ---------------------------------------------------------------------------------------------
 
 
-def name_rows(axes: Axes, labels: Sequence[str], width: int = 24) -> None:
+def name_rows(axes: Axes, labels: Sequence[str]) -> None:
     """Rows with names, from the top; every second one on a darker ground."""
     for row in range(1, len(labels), 2):
         axes.axhspan(row - 0.5, row + 0.5, color="#f5f5f5", linewidth=0, zorder=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), yticks=range(len(labels)))
-    axes.set_yticklabels([wrapped(label, width) for label in labels])
+    axes.set_yticklabels([wrapped(label, 24) for label in labels])
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False, axis="y")
 
@@ -310,7 +309,15 @@ def add_legend(figure: Figure, beside: bool = False) -> Figure:
         lines = rows * max(label.count("\n") + 1 for label in labels)
         figure.set_figheight(figure.get_figheight() + 0.13 * lines)
         options = {"loc": "outside upper left", "ncols": columns, "alignment": "left"}
-    _write_labels(figure.legend(*_entries(found), **options), found, labels)
+    # a legend leaves out labels that begin with an underscore, so it gets numbers first
+    legend = figure.legend([_handle(artist) for artist in found.values()], list(map(str, range(len(found)))), **options)
+    for text, handle, label, artist in zip(
+        legend.get_texts(), legend.legend_handles, labels, found.values(), strict=True
+    ):
+        text.set_text(label)
+        for part in (text, handle):
+            if part is not None:  # an entry is hidden with what it stands for
+                part.set_gid(artist.get_gid())
     return figure
 
 
@@ -323,22 +330,6 @@ def labelled(panels: Sequence[Axes]) -> dict[str, Artist]:
             if not UNNAMED.fullmatch(label):
                 found.setdefault(label, artist)
     return found
-
-
-def _entries(found: Mapping[str, Artist]) -> tuple[list[Artist], list[str]]:
-    """Handles and labels of a legend; it leaves out labels that begin with an underscore, so it gets numbers first."""
-    return [_handle(artist) for artist in found.values()], [str(number) for number in range(len(found))]
-
-
-def _write_labels(legend: Legend, found: Mapping[str, Artist], labels: Sequence[str]) -> None:
-    """The labels in place of the numbers; an entry is hidden with what it stands for."""
-    for text, handle, label, artist in zip(
-        legend.get_texts(), legend.legend_handles, labels, found.values(), strict=True
-    ):
-        text.set_text(label)
-        for part in (text, handle):
-            if part is not None:
-                part.set_gid(artist.get_gid())
 
 
 def _handle(artist: Any) -> Artist:

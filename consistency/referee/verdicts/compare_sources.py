@@ -30,7 +30,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.parsing import HUGE, read_json, reading
 from consistency.referee.readers.options import REPEATS, SourceOptions
 from consistency.referee.show.blocks import Block, Document, Text
-from consistency.referee.system import SCHEMA_VERSION, manifest_of, write_whole, writing
+from consistency.referee.system import SCHEMA_VERSION, digest_of_file, manifest_of, write_whole, writing
 from consistency.referee.verdicts.judge_sources import Source, skip_asked, source_of
 from consistency.referee.verdicts.tables import comparison_table
 
@@ -282,17 +282,10 @@ def _option(skip: Skip | None) -> str | None:
 
 
 def _digest(truth: Path) -> str:
-    digest = hashlib.sha256()
     paths = [truth]
     if not truth.is_file():
         paths = sorted(path for path in truth.rglob("*") if path.is_file())
-    for path in paths:
-        with path.open("rb") as file:
-            own = hashlib.sha256()
-            for piece in iter(lambda: file.read(2**20), b""):
-                own.update(piece)
-            digest.update(own.digest())
-    return digest.hexdigest()
+    return hashlib.sha256(b"".join(map(digest_of_file, paths))).hexdigest()
 
 
 def write_baseline(base: Baseline, path: Path, overwrite: bool = False) -> None:

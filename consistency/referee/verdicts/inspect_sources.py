@@ -369,7 +369,12 @@ def _groups(path: Path, tried: Attempt) -> list[str]:
     names = [name for name in _names(path, tried.reading) if QUALITY.fullmatch(name)]
     names = [name for name in names if name.lower() not in COUNTED and not COVARIANCE.search(name)]
     if file_kinds.is_bag(path):
-        names = ["turn_rate", "speed", *_fixes(path, tried.reading)]
+        from consistency.referee.readers.formats.ros_bag import ESTIMATES, SINCE, topics_of
+
+        used = (tried.reading.sources.topic, tried.reading.sources.truth_topic)
+        topics = [one.name for one in topics_of(path) if one.kind in ESTIMATES and one.name not in used]
+        # a filter may take other topics of poses or fixes as measurements
+        names = ["turn_rate", "speed", *(SINCE + topic for topic in topics if not TRUTH.search(topic))]
         path = path if file_kinds.is_one_bag(path) else min(filter(file_kinds.is_one_bag, path.iterdir()))
     elif file_kinds.is_solution(path):
         names = ["Q", "ns"]
@@ -378,15 +383,6 @@ def _groups(path: Path, tried: Attempt) -> list[str]:
             others = listed([other for other in names if other != name])
             return [f"--by {name} says where the covariance is wrong" + (f"; also {others}" if others else "")]
     return []
-
-
-def _fixes(path: Path, r: Reading) -> list[str]:
-    """Groups by the time since another topic of poses or fixes, which a filter may take as measurements."""
-    from consistency.referee.readers.formats.ros_bag import ESTIMATES, SINCE, topics_of
-
-    used = (r.sources.topic, r.sources.truth_topic)
-    others = [one for one in topics_of(path) if one.kind in ESTIMATES and one.name not in used]
-    return [SINCE + one.name for one in others if not TRUTH.search(one.name)]
 
 
 # --- files that are not judged with their truth -------------------------------------------------------

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.record import Record
+from consistency.referee.diagnostics.record import Record, Skip, skip_of
 from consistency.referee.diagnostics.verdict import Verdict
 from consistency.referee.diagnostics.verdict_parts import Settings
 from consistency.referee.errors import InputError
@@ -20,7 +20,6 @@ from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.planning import Design
-    from consistency.referee.diagnostics.record import Skip
 
 OPTION = {"ratio": "detect", "false_alarm": "false-alarm", "max_runs": "max-runs"}  # as commands call settings
 
@@ -131,8 +130,6 @@ def skip_asked(given: str | float | Skip | None) -> Skip | None:
     """
     if given is None:
         return None
-    from consistency.referee.diagnostics.record import skip_of
-
     try:
         return skip_of(given)
     except ValueError as error:

@@ -107,8 +107,7 @@ def make_monitor(
     try:
         return Monitor(false_alarm, tolerance, share, mission)
     except ValueError as error:
-        name, rest = str(error).split(" ", 1)
-        raise InputError(f"--{name.replace('_', '-')} {rest}") from None
+        raise refused(error) from None
 
 
 def refuse_bags(path: Path) -> None:

@@ -54,7 +54,8 @@ if TYPE_CHECKING:
 
 FILTER = Column("Filter")
 IN_WORLD = 3  # of these are shown of the additive error, too
-LENGTHS, ANGLES = ("x", "y", "z"), ("heading", "roll", "pitch", "yaw")  # components of poses
+UNITS = dict.fromkeys(("RMSE x", "RMSE y", "RMSE z"), " (m)")
+UNITS |= dict.fromkeys(("RMSE heading", "RMSE roll", "RMSE pitch", "RMSE yaw"), " (rad)")
 MAP_COLUMNS = (
     Column("Verdict on the map", "Verdict on\nthe map", width="1.2fr"),
     Column("Mean NEES / 3 of landmarks", "Mean NEES / 3\nof landmarks", number=True),
@@ -318,14 +319,6 @@ def document(verdicts: Mapping[str, Verdict], title: str = "", reasons: bool = T
     ``true / stated``: ratio of the covariances, 95 % interval; of the axis that decides, where one does. A filter that
     is judged in an error of its own has a second row, in the additive error of the world.
     """
-    blocks: list[Block] = [_overview(verdicts), *(Text(line) for line in _below(verdicts))]
-    if reasons:
-        blocks.append(Reasons(tuple(reason(v, name, verbose=verbose) for name, v in verdicts.items())))
-        blocks += region_tables(verdicts)
-    return Document(title, "", (), tuple(blocks), dict(verdicts))
-
-
-def _overview(verdicts: Mapping[str, Verdict]) -> Table:
     own = any(v.world is not None for v in verdicts.values())
     rows: list[tuple[Cell, ...]] = []
     for name, v in verdicts.items():
@@ -333,7 +326,12 @@ def _overview(verdicts: Mapping[str, Verdict]) -> Table:
         rows.append((name, *[error] * own, *cells(TERMINAL, v)))
         if v.world is not None:
             rows.append(("", f"{ADDITIVE}, beside it", *cells(TERMINAL[:IN_WORLD], v.world)))
-    return table((Column("filter"), *[Column("error")] * own, *columns(TERMINAL)), rows, "Verdicts")
+    heads = Column("filter"), *[Column("error")] * own, *columns(TERMINAL)
+    blocks: list[Block] = [table(heads, rows, "Verdicts"), *map(Text, _below(verdicts))]
+    if reasons:
+        blocks.append(Reasons(tuple(reason(v, name, verbose=verbose) for name, v in verdicts.items())))
+        blocks += region_tables(verdicts)
+    return Document(title, "", (), tuple(blocks), dict(verdicts))
 
 
 def _below(verdicts: Mapping[str, Verdict]) -> list[str]:
@@ -379,28 +377,12 @@ def comparison_table(a: str, b: str, c: Comparison) -> Table:
     return table((Column(""), *numbers), [_row(d) for d in c.differences], f"{heads[0]} and {heads[1]}")
 
 
-def _unit(name: str) -> str:
-    """The unit of an RMSE of a pose, as it stands behind its name."""
-    component = name.removeprefix("RMSE ")
-    if component == name:
-        return ""
-    if component in LENGTHS:
-        return " (m)"
-    return " (rad)" if component in ANGLES else ""
-
-
 def _row(d: Difference) -> tuple[str, ...]:
     if "coverage" in d.name:
         values = (f"{100 * v:.1f} %" for v in (d.a, d.b))
         return d.name, *values, "", f"{100 * d.difference:+.1f} %", f"{100 * d.low:+.1f} to {100 * d.high:+.1f} %"
-    return (
-        d.name + _unit(d.name),
-        f"{d.a:.3g}",
-        f"{d.b:.3g}",
-        f"x{d.difference:.3g}",
-        "",
-        f"{d.low:.3g} to {d.high:.3g}",
-    )
+    name = d.name + UNITS.get(d.name, "")
+    return name, f"{d.a:.3g}", f"{d.b:.3g}", f"x{d.difference:.3g}", "", f"{d.low:.3g} to {d.high:.3g}"
 
 
 def map_cells(m: MapScore) -> tuple[Cell, ...]:

@@ -44,25 +44,26 @@ def files(valid, tmp_path):
 # --- tables of estimates ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", ["1e308", "-1e308", "3e30", "inf"])
-def test_an_estimate_beyond_all_measure_is_a_failed_run(files, value):
-    path = files / "table" / "est.csv"
+def change_row_5(path, value):
+    """Another x in the sixth row of a table."""
     table = pd.read_csv(path, dtype=str)
     table.loc[5, "x"] = value
     table.to_csv(path, index=False)
-    recording = read(path, truth=files / "table" / "truth.csv")
+
+
+@pytest.mark.parametrize("value", ["1e308", "-1e308", "3e30", "inf"])
+def test_an_estimate_beyond_all_measure_is_a_failed_run(files, value):
+    change_row_5(files / "table" / "est.csv", value)
+    recording = read(files / "table" / "est.csv", truth=files / "table" / "truth.csv")
     assert [(failure.run, failure.step) for failure in recording.failures] == [(0, 6)]
     assert "not finite" in recording.failures[0].reason
     assert np.nanmax(recording.errors.nees) < 1e6
 
 
 def test_a_truth_beyond_all_measure_is_refused(files):
-    path = files / "table" / "truth.csv"
-    table = pd.read_csv(path, dtype=str)
-    table.loc[5, "x"] = "1e308"
-    table.to_csv(path, index=False)
+    change_row_5(files / "table" / "truth.csv", "1e308")
     with pytest.raises(cs.InputError, match=r"truth\.csv, line 7: column 'x': not a finite number \(1e\+?308\)"):
-        read(files / "table" / "est.csv", truth=path)
+        read(files / "table" / "est.csv", truth=files / "table" / "truth.csv")
 
 
 def test_large_numbers_of_a_trajectory(files):

@@ -82,7 +82,7 @@ def test_another_world_carries_the_covariance_along(convention, rng):
     true = np.column_stack([own[:, :3] + e[:, :3], rotation(values + e[:, 3:], convention).as_quat()])
     P = np.broadcast_to(np.diag(SIGMA**2), (40, 6, 6)).copy()
     t = np.arange(40.0)
-    p = make_poses(None, t, own, P, np.ones(40, bool), t, true, "spatial", convention, 0.0)  # type: ignore[arg-type]
+    p = make_poses(None, t, own, P, np.ones(40, bool), t, true, "spatial", convention, 0.0)
     world = WorldTransform(Rotation.from_rotvec([0.2, -0.3, 0.5]), np.array([1.0, 2.0, 3.0]))
     q = moved(p, world)
     error = spatial_error(world.placed(true, "spatial"), q.own.estimate, convention)

@@ -319,7 +319,7 @@ print(*sorted(name for name in sys.modules if name.startswith("consistency.comma
 
 
 def test_a_command_is_a_row_and_a_function():
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    commands = typer.main.get_command(app).commands
     assert len(commands) == len(COMMANDS)
     for name in COMMANDS:
         assert commands[name].name == name
@@ -352,7 +352,7 @@ def test_the_list_on_the_core(monkeypatch, capsys):
 
 
 COMMAND_LINE = typer.main.get_command(app)
-SUBCOMMANDS = COMMAND_LINE.commands  # type: ignore[attr-defined]
+SUBCOMMANDS = COMMAND_LINE.commands
 LINES = [line for row in COMMANDS.values() for line in row.examples]
 
 

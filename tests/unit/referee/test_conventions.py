@@ -80,7 +80,7 @@ def test_the_notebook_says_what_the_command_says(tmp_path, monkeypatch, capsys):
 
 def test_the_table_declares_what_the_examples_do():
     rows = [line for line in PAGE.splitlines() if line.startswith("| [")]
-    assert [re.search(r"\]\(#([^)]*)\)", row).group(1) for row in rows] == [  # type: ignore[union-attr]
+    assert [re.search(r"\]\(#([^)]*)\)", row).group(1) for row in rows] == [
         name.lower().replace(" ", "-") for name in SECTIONS
     ]
     for row, section in zip(rows, SECTIONS.values(), strict=True):
@@ -123,8 +123,8 @@ def csv(_):
     own[:, 1:] -= SIGMA[:2] * rng.normal(size=(STEPS, 2))
     P = np.tile([SIGMA[0] ** 2, 0.0, SIGMA[1] ** 2], (STEPS, 1))
     write = {"delimiter": ",", "comments": ""}
-    np.savetxt("est.csv", np.column_stack([own, P]), header="step,a,b,P_a_a,P_a_b,P_b_b", **write)  # type: ignore[arg-type]
-    np.savetxt("truth.csv", true, header="step,a,b", **write)  # type: ignore[arg-type]
+    np.savetxt("est.csv", np.column_stack([own, P]), header="step,a,b,P_a_a,P_a_b,P_b_b", **write)
+    np.savetxt("truth.csv", true, header="step,a,b", **write)
     return ["est.csv", "--truth", "truth.csv", "--state", "a,b"]
 
 
@@ -155,7 +155,7 @@ def bag(ros):
         from test_bags import Drive, write
 
         name = "drive.bag" if ros == 1 else "drive"
-        write(Path(name), ros, "odometry", Drive(np.random.SeedSequence().entropy))  # type: ignore[arg-type]
+        write(Path(name), ros, "odometry", Drive(np.random.SeedSequence().entropy))
         return [name, "--topic", "/odom", "--truth-topic", "map:body"]
 
     return make

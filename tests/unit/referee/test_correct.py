@@ -43,6 +43,7 @@ from consistency.referee.fit_covariance.factors import (
 from consistency.referee.types import Failure
 
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+BLOCKS, PLACE = blocks_of(POSE, 6, False), blocks_of(POSE[:3], 3, False)
 
 
 def covariances(rng, runs, steps, n, spread=1.0):
@@ -68,9 +69,7 @@ def record_of(error, P, axes=()):
 def wrong(rng, runs=24, steps=40, factor=9.0, turn=0.5, rho=0.5):
     """A pose in space whose position is off by one factor and its rotation by another."""
     P = covariances(rng, runs, steps, 6)
-    return record_of(
-        drawn(rng, Factors(blocks_of(POSE, 6, False), np.array([factor, turn]), np.zeros(2)).applied(P), rho), P
-    )
+    return record_of(drawn(rng, Factors(BLOCKS, np.array([factor, turn]), np.zeros(2)).applied(P), rho), P)
 
 
 # --- blocks and factors -----------------------------------------------------------------------------------------------
@@ -88,37 +87,16 @@ def test_blocks_go_by_names():
     assert [b.places for b in blocks_of((), 3, False)] == [(0, 1, 2)]
 
 
-def test_one_factor_is_the_mean_nees_of_steps(rng):
-    P = covariances(rng, 5, 7, 3)
-    error = rng.normal(size=(5, 7, 3))
-    error[1, 4:] = np.nan
-    P[1, 4:] = np.nan
-    values = np.full((5, 7), np.nan)
-    values[np.isfinite(error[..., 0])] = nees(error[np.isfinite(error[..., 0])], P[np.isfinite(error[..., 0])])
-    record = changed(
-        record_of(np.ones((5, 7, 3)), np.broadcast_to(np.eye(3), (5, 7, 3, 3)).copy()),
-        error=error,
-        covariance=P,
-        nees=values,
-    )
-    fit = fit_alone(record, blocks_of(record.errors.axes, 3, False))
-    assert fit.factors.factor == pytest.approx([np.nanmean(values) / 3])
-    assert fit.left_out[2].factor == pytest.approx([np.nanmean(np.delete(values, 2, axis=0)) / 3])
-
-
 def test_factors_are_the_most_likely_ones(rng):
     record = wrong(rng, runs=4)
-    blocks = blocks_of(POSE, 6, False)
-    assert record.errors.covariance is not None
-    assert record.errors.error is not None
     P, e = record.errors.covariance, record.errors.error
 
     def loss(logs):
-        C = Factors(blocks, np.exp(logs), np.zeros(2)).applied(P)
+        C = Factors(BLOCKS, np.exp(logs), np.zeros(2)).applied(P)
         return float(nees(e, C).mean() + np.linalg.slogdet(C)[1].mean())
 
     found = optimize.minimize(loss, np.zeros(2), tol=1e-12).x
-    Q = run_moments(record, blocks)
+    Q = run_moments(record, BLOCKS)
     assert np.log(fit_factors(Q.mean(axis=0), np.array([3.0, 3.0]))) == pytest.approx(found, abs=1e-4)
 
 
@@ -131,10 +109,8 @@ def test_factors_of_any_size_are_found(rng):
 
 def test_runs_are_the_unit(rng):
     record = wrong(rng, runs=6, steps=10)
-    assert record.errors.error is not None
-    assert record.errors.covariance is not None
     twice = record_of(np.repeat(record.errors.error, 3, axis=1), np.repeat(record.errors.covariance, 3, axis=1))
-    once, again = (fit_runs(each, blocks_of(POSE, 6, False)) for each in (record, twice))
+    once, again = (fit_runs(each, BLOCKS) for each in (record, twice))
     for one, other in zip(once.factor, again.factor, strict=True):
         assert tuple(one) == pytest.approx(tuple(other), rel=1e-6)
 
@@ -153,8 +129,6 @@ def test_a_covariance_is_scaled_by_blocks():
 
 def test_a_run_has_no_say_in_its_own_factors(rng):
     record = wrong(rng, runs=6)
-    assert record.errors.error is not None
-    assert record.errors.covariance is not None
     error = record.errors.error.copy()
     error[3] *= 20.0
     one, other = (correct(each) for each in (record, record_of(error, record.errors.covariance)))
@@ -177,8 +151,6 @@ def test_known_factors_are_found_and_judged_right():
 
 def test_the_gain_is_of_log_densities(rng):
     record = wrong(rng, runs=3, steps=5)
-    assert record.errors.error is not None
-    assert record.errors.covariance is not None
     scores_of = held_out_by(record).scores
     for run in range(3):
         density = [
@@ -205,9 +177,7 @@ def test_uncertain_factors_lengthen_no_tails():
     error = np.zeros((1, 4, 3))
     error[0, :, 1] = np.sqrt(squares)
     record = record_of(error, np.broadcast_to(np.eye(3), (1, 4, 3, 3)).copy())
-    blocks = blocks_of(record.errors.axes, 3, False)
-    found = with_uncertainty(record, blocks, np.array([[8.0]]))
-    assert found.errors.nees is not None
+    found = with_uncertainty(record, PLACE, np.array([[8.0]]))
     assert found.errors.nees[0] == pytest.approx(stats.chi2.ppf(p, 3), rel=1e-6)
 
 
@@ -235,15 +205,12 @@ def test_many_runs_off_by_a_factor_are_consistent_after():
 def test_few_runs_are_undecided_after_and_say_how_many_would_decide():
     found = correct(wrong(np.random.default_rng(3), runs=6))
     assert found.status == "undecided"
-    assert found.needed is not None
     assert found.needed > 6
     assert f"about {found.needed} runs would decide" in repr(found)
 
 
 def test_what_no_factor_mends_is_named(rng):
     record = wrong(rng, runs=40, rho=0.0)
-    assert record.errors.error is not None
-    assert record.errors.covariance is not None
     heavy = record.errors.error * np.sqrt(2.0 / rng.chisquare(2.0, (40, 40, 1)))
     biased = record.errors.error + 3.0 * np.sqrt(np.diagonal(record.errors.covariance, axis1=2, axis2=3))
     for error, word in ((heavy, "heavy"), (biased, "mean error")):
@@ -255,8 +222,6 @@ def test_what_no_factor_mends_is_named(rng):
 
 def test_a_run_that_failed_from_the_start_counts(rng):
     record = wrong(rng, runs=8)
-    assert record.errors.error is not None
-    assert record.errors.nees is not None
     error, values = record.errors.error.copy(), record.errors.nees.copy()
     error[2], values[2] = np.nan, np.nan
     broken = changed(record, error=error, nees=values, failures=(Failure("est", 2, 1, "estimate is not finite"),))
@@ -303,7 +268,7 @@ def test_a_floor_is_found_where_it_is():
     fits = []
     for _ in range(2):
         record = with_floor(np.random.default_rng(), 2.0, 20.0)
-        fits.append(fit_runs(record, blocks_of(record.errors.axes, 3, False)))
+        fits.append(fit_runs(record, PLACE))
     assert any(
         all(
             abs(value - true) < 1.25 * (interval.high - interval.low) + 0.02 * true
@@ -320,7 +285,7 @@ def test_a_floor_is_found_where_it_is():
 def test_no_floor_is_kept_that_data_do_not_ask_for():
     rng = np.random.default_rng(5)
     record = with_floor(rng, 2.0, 0.0)
-    fit = fit_runs(record, blocks_of(record.errors.axes, 3, False))
+    fit = fit_runs(record, PLACE)
     assert fit.factors.floor.tolist() == [0.0]
     assert fit.floor[0].low == 0.0
     assert fit.floor[0].high > 0.0
@@ -331,7 +296,7 @@ def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval():
     rng = np.random.default_rng(2)
     P = covariances(rng, 20, 40, 3)
     record = record_of(drawn(rng, np.broadcast_to(50.0 * np.eye(3), P.shape).copy()), P)
-    fit = fit_runs(record, blocks_of(record.errors.axes, 3, False))
+    fit = fit_runs(record, PLACE)
     assert fit.factors.floor[0] == pytest.approx(50.0, rel=0.2)
     assert fit.factor[0].low == 0.0
     assert 0.0 < fit.factor[0].high < 2.0
@@ -340,16 +305,15 @@ def test_a_factor_of_0_beside_a_floor_has_a_one_sided_interval():
 def test_a_floor_is_not_told_from_a_covariance_of_its_shape(rng):
     P = np.broadcast_to(2.0 * np.eye(3), (6, 20, 3, 3)).copy()
     record = record_of(drawn(rng, 3.0 * P), P)
-    blocks = blocks_of(record.errors.axes, 3, False)
-    assert likeness(record, blocks[0]) == pytest.approx(1.0)
-    fit = fit_runs(record, blocks)
+    assert likeness(record, PLACE[0]) == pytest.approx(1.0)
+    fit = fit_runs(record, PLACE)
     assert fit.factors.floor.tolist() == [0.0]
     assert "cannot be told apart" in fit.notes[0]
 
 
 def test_gradients_and_information_are_those_of_the_likelihood(rng):
     record = wrong(rng, runs=3, steps=30)
-    blocks, free = blocks_of(POSE, 6, False), np.array([0, 1])
+    blocks, free = BLOCKS, np.array([0, 1])
     theta = np.array([4.0, 0.7, 0.8, 0.3])
     _, gradient, information = scores(record, blocks, free, theta)
     h = 1e-5
@@ -363,11 +327,10 @@ def test_gradients_and_information_are_those_of_the_likelihood(rng):
 def test_sizes_by_other_factors_are_those_of_the_covariances(rng):
     """In the mean over steps, by the trace of the inverse of one times the other."""
     record = wrong(rng, runs=2, steps=5)
-    blocks = blocks_of(POSE, 6, False)
-    whole = Factors(blocks, np.array([4.0, 0.7]), np.array([0.8, 0.3]))
-    other = Factors(blocks, np.array([3.0, 0.9]), np.array([0.5, 0.6]))
+    whole = Factors(BLOCKS, np.array([4.0, 0.7]), np.array([0.8, 0.3]))
+    other = Factors(BLOCKS, np.array([3.0, 0.9]), np.array([0.5, 0.6]))
     expected = np.zeros(2)
-    for b, block in enumerate(blocks):
+    for b, block in enumerate(BLOCKS):
         ratios = np.linalg.inv(block.of(whole.applied(record.errors.covariance))) @ block.of(
             other.applied(record.errors.covariance)
         )
@@ -393,7 +356,7 @@ def test_the_chance_of_1_is_5_percent_at_the_end_of_an_interval():
 
 def test_factors_are_needed_all_together(rng):
     """One of two at a chance of 3 % is no more than chance has, where two are asked."""
-    fit = fit_alone(wrong(rng), blocks_of(POSE, 6, False))
+    fit = fit_alone(wrong(rng), BLOCKS)
     assert are_needed([replace(fit, chance=(0.03,))])
     assert not are_needed([replace(fit, chance=(0.03, 0.5))])
     assert not are_needed([replace(fit, chance=(0.03,)), replace(fit, chance=(0.5,))])
@@ -416,9 +379,9 @@ def test_no_factor_is_invented_where_the_covariance_is_right():
     invented = 0
     for _ in range(200):
         P = covariances(rng, 6, 10, 6)
-        invented += are_needed([fit_alone(record_of(drawn(rng, P), P), blocks_of(POSE, 6, False))])
+        invented += are_needed([fit_alone(record_of(drawn(rng, P), P), BLOCKS)])
     assert invented < 32
-    assert are_needed([fit_alone(wrong(rng), blocks_of(POSE, 6, False))])
+    assert are_needed([fit_alone(wrong(rng), BLOCKS)])
 
 
 def test_a_floor_at_zero_has_a_one_sided_interval():
@@ -436,7 +399,6 @@ def ragged(rng, runs=20, steps=30):
     """A right estimator whose runs have unlike numbers of steps, none of which depends on the errors."""
     P = covariances(rng, runs, steps, 3)
     record = record_of(drawn(rng, P), P)
-    assert record.errors.nees is not None
     counted = np.arange(steps) < rng.integers(2, steps + 1, runs)[:, None]
     return changed(record, nees=np.where(counted, record.errors.nees, np.nan))
 
@@ -444,7 +406,7 @@ def ragged(rng, runs=20, steps=30):
 def test_runs_count_by_their_steps(rng):
     record = ragged(rng)
     counts = np.isfinite(record.errors.nees).sum(axis=1)
-    fit = fit_alone(record, blocks_of(record.errors.axes, 3, False))
+    fit = fit_alone(record, PLACE)
     assert fit.factors.factor == pytest.approx(np.nansum(record.errors.nees) / (3 * counts.sum()))
     others = np.delete(record.errors.nees, 4, axis=0)
     assert fit.left_out[4].factor == pytest.approx(np.nansum(others) / (3 * np.delete(counts, 4).sum()))
@@ -459,11 +421,10 @@ def test_runs_count_by_their_steps(rng):
 
 def test_scores_count_by_steps(rng):
     record = ragged(rng, runs=4)
-    blocks = blocks_of(record.errors.axes, 3, False)
-    value, gradient, information = scores(record, blocks, np.array([0]), np.array([1.2, 0.1]))
+    value, gradient, information = scores(record, PLACE, np.array([0]), np.array([1.2, 0.1]))
     counts = np.isfinite(record.errors.nees).sum(axis=1)
     for run in range(4):
-        alone = scores(record.of_runs(np.array([run])), blocks, np.array([0]), np.array([1.2, 0.1]))
+        alone = scores(record.of_runs(np.array([run])), PLACE, np.array([0]), np.array([1.2, 0.1]))
         assert value[run] == pytest.approx(alone[0][0] * counts[run] / counts.mean())
         assert gradient[run] == pytest.approx(alone[1][0] * counts[run] / counts.mean())
         assert information[run] == pytest.approx(alone[2][0] * counts[run] / counts.mean())
@@ -481,9 +442,8 @@ def test_a_right_filter_needs_no_factor_by_how_its_runs_end(seed):
 
 def test_several_fits_ask_more_of_a_floor():
     record = with_floor(np.random.default_rng(6), 2.0, 20.0)
-    blocks = blocks_of(record.errors.axes, 3, False)
-    assert fit_runs(record, blocks, 20).factors.floor[0] > 0.0
-    assert fit_runs(record, blocks, 10**30).factors.floor[0] == 0.0
+    assert fit_runs(record, PLACE, 20).factors.floor[0] > 0.0
+    assert fit_runs(record, PLACE, 10**30).factors.floor[0] == 0.0
 
 
 def test_groups_have_factors_of_their_own_runs(rng):
@@ -491,16 +451,13 @@ def test_groups_have_factors_of_their_own_runs(rng):
     index = rng.integers(-1, 2, (6, 40))
     index[:5][index[:5] == 1] = 0
     groups = Groups("speed", ("slow", "fast"), index, (1.0,))
-    fits = fit_groups(replace(record, groups=groups), blocks_of(POSE, 6, False))
+    fits = fit_groups(replace(record, groups=groups), BLOCKS)
     assert list(fits) == ["slow", "fast", ""]
-    assert record.errors.nees is not None
     slow = changed(record, nees=np.where(index == 0, record.errors.nees, np.nan))
     assert fits["slow"].factors.factor == pytest.approx(fit_runs(slow, fits[""].factors.blocks).factors.factor)
     assert fits["fast"].factors == fits[""].factors
     assert "fewer than two runs" in fits["fast"].notes[0]
     found = correct(replace(record, groups=groups))
-    assert record.errors.covariance is not None
-    assert found.after.record.errors.covariance is not None
     run, step = (int(each[0]) for each in np.nonzero(index == -1))
     expected = fits[""].left_out[run].applied(record.errors.covariance[run, step])
     assert found.after.record.errors.covariance[run, step] == pytest.approx(expected)

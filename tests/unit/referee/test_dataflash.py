@@ -29,6 +29,11 @@ GATES = {
 }
 
 
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.bin"
+
+
 def flight(path, ratios, message="XKF4", gates=GATES):
     """Test ratios by field."""
     log = Flight(message).set(gates)
@@ -91,7 +96,7 @@ def test_older_filters_cores_and_gates_that_are_missing(tmp_path):
         read_ratios(path, "sonar", 0)
 
 
-def test_the_nis_of_innovations_with_their_variances(tmp_path):
+def test_the_nis_of_innovations_with_their_variances(path):
     rng = np.random.default_rng()
     own, variance = rng.normal(size=(30, 3)), np.exp(rng.normal(size=(30, 3)))
     own[7], variance[7] = own[6], variance[6]
@@ -102,7 +107,7 @@ def test_the_nis_of_innovations_with_their_variances(tmp_path):
         }
         log.log("XKFD", 10**7 + k * STEP, values)
         log.log("XKF0", 10**7 + k * STEP, {"ID": k % 3, "innov": 0.01 * (k - 15), "SIV": 0.5})
-    path = log.write(tmp_path / "a.bin")
+    log.write(path)
     odometry, beacon = (read_innovations(path, sensor) for sensor in ("odometry", "beacon"))
     there = np.arange(30) != 7
     assert_allclose(odometry.nis[there], (own**2 / variance).sum(axis=1)[there], rtol=1e-5)
@@ -127,8 +132,7 @@ def test_one_command_from_a_flight_to_a_picture(tmp_path, capsys):
     assert "alarm" not in data
 
 
-def test_what_cannot_be_used_is_one_line(tmp_path, capsys):
-    path = tmp_path / "a.bin"
+def test_what_cannot_be_used_is_one_line(path, capsys):
     assert "a.bin: no such file" in refused(capsys, "monitor", path)
     for content in (b"", b"not a log", bytes(1000)):
         path.write_bytes(content)
@@ -156,8 +160,8 @@ def test_what_cannot_be_used_is_one_line(tmp_path, capsys):
         assert "a log of ArduPilot needs pymavlink: pip install " in refused(capsys, "monitor", path)
 
 
-def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
-    path = flight(tmp_path / "a.bin", {"SH": np.linspace(0.1, 0.9, 50)})
+def test_a_log_that_is_cut_short_is_read_as_far_as_it_goes(path):
+    flight(path, {"SH": np.linspace(0.1, 0.9, 50)})
     whole = path.read_bytes()
     path.write_bytes(whole[:-700])
     (only,), _ = read_ratios(path)

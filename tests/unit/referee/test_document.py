@@ -318,6 +318,7 @@ def test_a_terminal_has_numbers_at_the_right_and_verdicts_in_their_colours(capsy
 @pytest.mark.parametrize(
     "named, shown",
     [
+        ([], []),
         ([("mine", "consistent")], ["consistent"]),
         ([("mine", "consistent"), ("yours", "biased")], ["consistent mine", "biased yours"]),
         ([(f"f{k}", "failed" if k else "consistent") for k in range(9)], ["consistent 1", "failed 8"]),

@@ -75,10 +75,10 @@ def estimates(folder, body=None):
 def test_a_trajectory_and_a_table_are_judged_by_a_drive(drive):
     spatial, planar = estimates(drive)
     [r] = read_recordings(drive.parent / "est.tum", drive)
-    assert_allclose(r.errors.error[0], spatial, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.errors.error[0], spatial, atol=1e-8)
     assert "the path of the imu as its first pose sees it" in r.origin.notes[0]
     [r] = read_recordings(drive.parent / "est.csv", drive)
-    assert_allclose(r.errors.error[0], planar, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.errors.error[0], planar, atol=1e-8)
     record = cs.read(drive.parent / "est.csv", truth=drive, body="velodyne")
     assert np.abs(np.asarray(record.errors.error)[0] - planar).max() > 0.01
 
@@ -86,10 +86,10 @@ def test_a_trajectory_and_a_table_are_judged_by_a_drive(drive):
 def test_the_body_is_chosen(drive):
     spatial, _ = estimates(drive, "camera")
     [r] = read_recordings(drive.parent / "est.tum", drive, body="camera")
-    assert_allclose(r.errors.error[0], spatial, atol=1e-8)  # type: ignore[index]
+    assert_allclose(r.errors.error[0], spatial, atol=1e-8)
     assert "the path of the camera" in r.origin.notes[0]
     [other] = read_recordings(drive.parent / "est.tum", drive)
-    assert np.abs(other.errors.error[0] - spatial).max() > 1.0  # type: ignore[index]
+    assert np.abs(other.errors.error[0] - spatial).max() > 1.0
 
 
 def test_a_folder_of_runs_has_a_drive_for_each_or_one_for_all(drive):
@@ -98,7 +98,7 @@ def test_a_folder_of_runs_has_a_drive_for_each_or_one_for_all(drive):
     shutil.copy(drive.parent / "est.tum", drive.parent / "est" / f"{drive.name}.tum")
     for truth in (drive, drive.parent):
         [r] = read_recordings(drive.parent / "est", truth)
-        assert_allclose(r.errors.error[0], spatial, atol=1e-8)  # type: ignore[index]
+        assert_allclose(r.errors.error[0], spatial, atol=1e-8)
 
 
 def test_what_is_wrong_with_a_drive_is_said(drive):
@@ -159,8 +159,8 @@ def test_states_are_judged_component_by_component(cameras, more, tmp_path):
     found = read_recordings(*files)
     assert [r.name for r in found] == [f"state_estimate {axis}" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
     for i, r in enumerate(found):
-        assert_allclose(r.errors.error[0, :, 0], e[:, i], atol=1e-9)  # type: ignore[index]
-        assert_allclose(r.errors.covariance[0, :, 0, 0], sigma[:, i] ** 2, rtol=1e-9)  # type: ignore[index]
+        assert_allclose(r.errors.error[0, :, 0], e[:, i], atol=1e-9)
+        assert_allclose(r.errors.covariance[0, :, 0, 0], sigma[:, i] ** 2, rtol=1e-9)
         assert r.errors.convention == "so3-body"
     [yaw] = read_recordings(*files, axes=["yaw"])
     assert yaw.errors.axes == ("yaw",)
@@ -179,10 +179,10 @@ def test_velocity_and_biases_of_states(tmp_path):
         assert rest.name == "state_estimate velocity and biases"
         assert rest.errors.axes == ("vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz")
         assert rest.errors.parts == tuple((i,) for i in range(9))
-        assert_allclose(rest.errors.error[0], e[:, 6:], atol=1e-9)  # type: ignore[index]
-        assert_allclose(np.diagonal(rest.errors.covariance[0], axis1=1, axis2=2), sigma[:, 6:] ** 2, rtol=1e-9)  # type: ignore[index]
+        assert_allclose(rest.errors.error[0], e[:, 6:], atol=1e-9)
+        assert_allclose(np.diagonal(rest.errors.covariance[0], axis1=1, axis2=2), sigma[:, 6:] ** 2, rtol=1e-9)
     [bias] = read_recordings(est, truth, deviation, axes=["bgy"])
-    assert_allclose(bias.errors.error[0, :, 0], e[:, 10], atol=1e-9)  # type: ignore[index]
+    assert_allclose(bias.errors.error[0, :, 0], e[:, 10], atol=1e-9)
     np.savetxt(tmp_path / "tum.txt", rows[:, [0, 5, 6, 7, 1, 2, 3, 4]])
     assert len(read_recordings(est, tmp_path / "tum.txt", deviation)) == 6
     found = read_recordings(est, truth, deviation, align="posyaw-all")

@@ -60,7 +60,6 @@ def begun(work, word="list", ignored=None, err=subprocess.PIPE):
         [sys.executable, "-c", COMMAND.format(word=word, work=work)], stdout=subprocess.PIPE, stderr=err, text=True,
         start_new_session=True, preexec_fn=as_in_a_terminal,
     )  # fmt: skip
-    assert process.stdout is not None
     process.stdout.readline()
     return process
 
@@ -195,7 +194,6 @@ def test_a_worker_ends_with_its_parent(prctl, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(WORKER.format(prctl=prctl))
     with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "there\n"
         process.kill()
         assert select.select([process.stdout], [], [], 20.0)[0], "the worker has the pipe as long as it lives"
@@ -226,7 +224,7 @@ def killed_while(work):
     """Do ``work`` in a process that is killed then."""
     child = os.fork()
     if child == 0:
-        work()  # type: ignore[operator]
+        work()
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
 

@@ -25,9 +25,7 @@ def states(convention, n=15):
     e = 0.5 * rng.normal(size=(RUNS, STEPS, n))
     root = rng.normal(size=(RUNS, STEPS, n, n))
     P = root @ np.swapaxes(root, -1, -2) + np.eye(n)
-    keys = (
-        {"R": (3, 3), "p": (3,), "v": (3,), "bg": (3,), "ba": (3,)} if n == 15 else {"R": (3, 3), "p": (3,), "v": (3,)}
-    )
+    keys = {"R": (3, 3), "p": (3,), "v": (3,)} | ({"bg": (3,), "ba": (3,)} if n == 15 else {})
     out = {f"{side}{key}": np.zeros((RUNS, STEPS, *shape)) for key, shape in keys.items() for side in ("", "true_")}
     for at in np.ndindex(RUNS, STEPS):
         phi, *rest = rng.normal(size=(3, 3))
@@ -162,7 +160,7 @@ def test_the_error_has_to_be_declared(options, tmp_path):
     with pytest.raises(
         cs.InputError, match=r"whose error is not known; add error=so3, .*, rvec, euler, additive: left"
     ):
-        cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)  # type: ignore[arg-type]
+        cs.read(read(tmp_path / "imu.npz", **arrays, covariances=P), **options)
 
 
 def test_windows_are_refused(tmp_path):
@@ -178,7 +176,12 @@ T = 1403715273.25 + 0.25 * np.arange(STEPS)
 POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 MOVING = ["vx", "vy", "vz", "bgx", "bgy", "bgz", "bax", "bay", "baz"]
 LABELS = ["x", "y", "z", "roll", "pitch", "yaw", *MOVING]
-PLACES = [3, 4, 5, 0, 1, 2, *range(6, 15)]  # position first, of the rotation first
+
+
+def position_first(arrays, e, P):
+    """States with errors (N, n) and covariances (N, n, n) of the first run."""
+    places = [3, 4, 5, 0, 1, 2, *range(6, P.shape[-1])]
+    return arrays, e[0][:, places], P[0][:, places][:, :, places]
 
 
 def w_first(R):
@@ -242,8 +245,7 @@ def nees(e, P):
     ],
 )
 def test_states_in_a_table(kind, form, n, inside):
-    arrays, e, P = states(kind, n)
-    e, P = e[0][:, PLACES[:n]], P[0][:, PLACES[:n]][:, :, PLACES[:n]]
+    arrays, e, P = position_first(*states(kind, n))
     record = cs.read(table(arrays, P, form), truth=named(arrays), error=kind)
     assert_allclose(record.errors.error[0], e, atol=1e-9)
     assert_allclose(record.errors.nees[0], nees(e, P), rtol=1e-9)
@@ -264,8 +266,7 @@ def test_the_truth_of_euroc_has_velocity_and_biases(name, header, inside, capsys
 
 
 def test_deviations_of_states_are_judged_component_by_component(inside):
-    arrays, e, P = states("so3")
-    e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
+    arrays, e, P = position_first(*states("so3"))
     record = cs.read(table(arrays, P, "deviations"), truth=named(arrays), error="so3")
     assert_allclose(record.errors.nees[0], (e**2 / np.diagonal(P, axis1=1, axis2=2)).sum(axis=1), rtol=1e-9)
     assert record.errors.parts == tuple((i,) for i in range(15))
@@ -273,10 +274,9 @@ def test_deviations_of_states_are_judged_component_by_component(inside):
 
 
 def test_the_true_velocity_between_two_samples(inside):
-    arrays, _, P = states("so3", 9)
+    arrays, _, P = position_first(*states("so3", 9))
     truth = columns(arrays, true=True)
     late = lines("truth.csv", ",".join(["t", *POSE, *MOVING[:3]]), [100.0 + 0.1 * np.arange(STEPS), *truth])
-    P = P[0][:, PLACES[:9]][:, :, PLACES[:9]]
     own = [np.repeat(column[:1], STEPS) for column in columns(arrays)]
     est = lines(
         "est.csv", ",".join(["t", *POSE, *MOVING[:3], *stated(9, "full")]),
@@ -290,8 +290,7 @@ def test_the_true_velocity_between_two_samples(inside):
 
 
 def test_without_a_true_velocity_the_pose_is_judged(inside):
-    arrays, e, P = states("so3")
-    e, P = e[0][:, PLACES], P[0][:, PLACES][:, :, PLACES]
+    arrays, e, P = position_first(*states("so3"))
     est = table(arrays, P, "named")
     for keep, what in ((0, "velocities"), (3, "biases")):
         less = {key: value for key, value in arrays.items() if keep or key not in ("true_v", "true_bg", "true_ba")}
@@ -314,7 +313,7 @@ def test_without_a_true_velocity_the_pose_is_judged(inside):
 def test_what_has_to_be_declared(options, said, inside):
     arrays, _, P = states("left", 9)
     with pytest.raises(cs.InputError, match=said):
-        cs.read(table(arrays, P[0], "full"), truth=named(arrays), **options)  # type: ignore[arg-type]
+        cs.read(table(arrays, P[0], "full"), truth=named(arrays), **options)
 
 
 def test_the_additive_error_is_of_states(inside):

@@ -8,11 +8,11 @@ import pytest
 from fit_covariance import World, drives
 from fit_sides import Side
 from numpy.testing import assert_allclose
+from odometry import windows
 from scipy import stats
 
 import consistency as cs
 from consistency.referee.fit_covariance import mean_and_noise as errors_
-from consistency.referee.fit_covariance.drives import cut_windows, span_of
 from consistency.referee.fit_covariance.mean_and_noise import (
     BACKWARD,
     FORWARD,
@@ -42,7 +42,7 @@ FIT = MeanFit(
 
 
 def cut(side, seed):
-    return cut_windows(sides.drives(np.random.default_rng(seed), side), span_of("1m"))
+    return windows(sides.drives(np.random.default_rng(seed), side), "1m")
 
 
 @pytest.mark.parametrize("in_space", [False, True])
@@ -126,7 +126,7 @@ def test_what_is_none_is_not_corrected(rng):
     for value, is_free, none in zip(found.mean.values, found.free, (1.0, 1.0, 0.0), strict=True):
         assert is_free or value == none
     assert np.abs(found.whole.values - [1, 1, 0]).min() > 0
-    w = cut_windows(drives(rng, 2), span_of("10m"))
+    w = windows(drives(rng, 2))
     w = replace(w, true=Mean(1.0, 0.95, (0.0,)).applied(w).motions, true_pieces=Mean(1.0, 0.95).corrected(w.pieces))
     assert choose_mean(w).mean.turn == pytest.approx(0.95, abs=1e-3)
 
@@ -151,7 +151,7 @@ def test_motion_that_lasts_for_less_than_a_window_is_a_weak_instrument():
         noise = rng.normal(size=steps.shape) * [0.02, 0.01, 0.05]
         true, estimate = (cs.drive_of("", s, s, motions=True).estimate for s in (steps, steps + noise))
         made.append(cs.Drive(f"d{i}", np.arange(100.0), np.arange(100), estimate, true))
-    found = choose_mean(cut_windows(made, span_of("3")))
+    found = choose_mean(windows(made, "3"))
     assert found.strength < 10
     assert found.instruments == FORWARD
     assert found.is_open
@@ -235,9 +235,10 @@ def test_the_floor_is_added():
     assert_allclose(noise.covariance(w.pieces), 2.0 * (np.tensordot(theta, F, (0, 1)) + np.diag(floor)))
 
 
-def test_jitter_of_the_truth_is_not_noise_of_the_way():
-    """The ratio at 20 spans, where jitter does not grow: 0.6 if it is taken for noise, 1 but for 10 % if it is not."""
-    _, ratio = sides.fitted(np.random.default_rng(2), Side(3, False, jitters=True))
+@pytest.mark.parametrize("seed, side", [(2, Side(3, False, jitters=True)), (3, Side(1))], ids=["jitter", "odometry"])
+def test_the_ratio_over_twenty_spans_is_right(seed, side):
+    """1 but for 10 %; 0.6 if jitter is taken for noise of the way, 1.8 by least squares where the odometry errs."""
+    _, ratio = sides.fitted(np.random.default_rng(seed), side)
     assert 0.75 < ratio < 1.3
 
 
@@ -250,12 +251,6 @@ def test_every_fit_that_is_judged_has_the_jitter(rng):
         assert (noise.floor >= jitter).all()
 
 
-def test_a_ratio_over_twenty_spans_with_noise_of_the_odometry():
-    """1.8 by least squares; 1 but for 10 % here."""
-    _, ratio = sides.fitted(np.random.default_rng(3), Side(1))
-    assert 0.75 < ratio < 1.3
-
-
 # --- sentences ------------------------------------------------------------------------------------------
 
 
@@ -265,7 +260,7 @@ def model():
 
 
 def said(model, **changes):
-    fit = replace(FIT, **changes)  # type: ignore[arg-type]
+    fit = replace(FIT, **changes)
     noise = replace(model.noise, mean=fit.mean, mean_fit=fit)
     return "\n".join([correction(replace(model, noise=noise)), *noise_lines(replace(model, noise=noise))])
 
@@ -293,7 +288,6 @@ def test_sentences_of_the_mean(model):
 
 def test_programs_have_the_evidence(model):
     fit, mean = model.noise.mean_fit, data_of_model(model)["mean"]
-    assert fit is not None
     assert mean["low"] == fit.low.tolist()
     assert mean["free"] == fit.free.tolist()
     assert mean["instruments"] == fit.instruments

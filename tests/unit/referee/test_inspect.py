@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import consistency, refused
+from draws import autoregression
 from drives import write_drive, write_states
 from flight import Flight
 from programs import write_tables
@@ -291,14 +292,6 @@ def test_poses_without_covariances_get_the_command_that_fits_them(tmp_path, caps
         assert "consistency fit-covariance" in out  # what drives take is named, too
 
 
-def autoregression(rng, rows, components, phi):
-    """Errors of a run (1, rows, components) in which neighbours are correlated by ``phi``; 1 is a constant."""
-    e = rng.standard_normal((rows, components))
-    for k in range(1, rows):
-        e[k] = phi * e[k - 1] + np.sqrt(1.0 - phi**2) * e[k]
-    return e[None]
-
-
 @pytest.mark.parametrize("rows", [30, 200, 1000])
 @pytest.mark.parametrize("components", [1, 6])
 def test_independent_rows_are_told_at_a_stated_rate(rows, components):
@@ -307,8 +300,9 @@ def test_independent_rows_are_told_at_a_stated_rate(rows, components):
     sizes = np.exp(np.arange(rows) // (rows // 3))[None, :, None]  # near tags, then far ones
 
     def told(phi, sizes=1.0, rows=rows):
-        records = (Record("e", Errors(sizes * autoregression(rng, rows, components, phi))) for _ in range(200))
-        return sum(map(_is_of_rows, records))
+        """How many of 200 runs whose neighbours are correlated by ``phi``; 1 is a constant."""
+        errors = sizes * autoregression(rng, 200, rows, components, phi)
+        return sum(_is_of_rows(Record("e", Errors(run[None]))) for run in errors)
 
     assert told(0.0) >= 188
     assert told(0.0, sizes) >= 188

@@ -58,6 +58,12 @@ def make(session, tests, name="test_it"):
     session.makepyfile(**{name: "from samples import *\n" + tests})
 
 
+def run(session, tests, *options):
+    """The session of a module of tests."""
+    make(session, tests)
+    return session.runpytest(*options)
+
+
 def gates_of(path):
     data = json.loads((path / "gates.json").read_text())
     return list(data["gates"])
@@ -86,8 +92,7 @@ def test_without():
 
 
 def test_gates_are_summed_up_and_written(session):
-    make(session, THREE)
-    result = session.runpytest("--consistency-report=gates.json", "--junitxml=junit.xml")
+    result = run(session, THREE, "--consistency-report=gates.json", "--junitxml=junit.xml")
     result.assert_outcomes(passed=3, failed=2)
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.stdout.fnmatch_lines(["E *ConsistencyError: assert_consistent: the estimator is overconfident*"])
@@ -133,31 +138,32 @@ def test_each_gate_that_fails_has_a_page(session):
 
 
 def test_no_gates_no_table(session):
-    make(session, "def test_without():\n    pass")
-    result = session.runpytest("--consistency-report=gates.json")
+    result = run(session, "def test_without():\n    pass", "--consistency-report=gates.json")
     result.assert_outcomes(passed=1)
     result.stdout.no_fnmatch_line("*consistency gates*")
     assert gates_of(session.path) == []
 
 
 def test_what_is_not_finite_is_null(session):
-    make(
-        session, "def test_innovations():\n    assert_consistent(nis=nees(9), nis_dof=3, detect=9.0, optimal_gain=True)"
-    )
-    session.runpytest("--consistency-report=gates.json").assert_outcomes(passed=1)
+    run(
+        session,
+        "def test_innovations():\n    assert_consistent(nis=nees(9), nis_dof=3, detect=9.0, optimal_gain=True)",
+        "--consistency-report=gates.json",
+    ).assert_outcomes(passed=1)
     (gate,) = gates_of(session.path)
     assert gate["inflation"] is None
 
 
 def test_a_comparison_is_recorded(session):
-    make(
+    result = run(
         session,
         "def test_it(consistency_runs):\n"
         "    good = nees(consistency_runs)\n"
         "    assert_not_worse(nees_a=good, nees_b=good, dof=3)\n"
         "    assert_not_worse(nees_a=3.0 * good, nees_b=good, dof=3)\n",
+        "--consistency-report=gates.json",
+        "--consistency-false-alarm=1e-3",
     )
-    result = session.runpytest("--consistency-report=gates.json", "--consistency-false-alarm=1e-3")
     result.assert_outcomes(failed=1)
     good, bad = gates_of(session.path)
     assert (good["gate"], good["status"], good["outcome"]) == ("assert_not_worse", "not worse", "passed")
@@ -234,7 +240,7 @@ def test_a_folder_without_leave_is_refused(tmp_path, monkeypatch):
 
 
 def test_the_marker_plans_and_is_asked(session):
-    make(
+    run(
         session,
         "@pytest.mark.consistency(dof=3, detect=2.0, false_alarm=1e-4)\n"
         "class TestIt:\n"
@@ -247,15 +253,15 @@ def test_the_marker_plans_and_is_asked(session):
         "        gate(nees(consistency_runs, 0.3))\n"
         "        with pytest.raises(InsufficientTrials):\n"
         "            gate(nees(9), detect=1.2)\n",
-    )
-    session.runpytest("--consistency-report=gates.json").assert_outcomes(passed=2)
+        "--consistency-report=gates.json",
+    ).assert_outcomes(passed=2)
     assert [each["false_alarm"] for each in gates_of(session.path)] == [1e-4] * 3
     assert session.runpytest("--markers").ret == 0
 
 
 def test_the_marker_that_plans_enough_runs_is_named(session):
     """Of a gate with an error of fewer dimensions than the fixture has planned for."""
-    make(
+    run(
         session,
         "def few(n, runs, **more):\n"
         "    nees = np.random.default_rng(1).chisquare(n, (runs // 8, 1))\n"
@@ -277,32 +283,30 @@ def test_the_marker_that_plans_enough_runs_is_named(session):
         f"    assert 'it gives {gate_runs(1, 2.0, 1e-3, 0.95)} runs' in few(1, consistency_runs, detect=2.0)\n"
         "def test_unasked():\n"
         "    assert '@pytest.mark' not in few(1, 100)\n",
-    )
-    session.runpytest().assert_outcomes(passed=4)
-    make(
+    ).assert_outcomes(passed=4)
+    run(
         session,
         "def test_given(consistency_runs):\n"
         "    with pytest.raises(InsufficientTrials) as info:\n"
         "        assert_consistent(nees=np.ones((consistency_runs, 1)), dof=1, false_alarm=1e-12)\n"
         "    assert '@pytest.mark' not in str(info.value)\n",
-    )
-    session.runpytest("--consistency-runs=5").assert_outcomes(passed=1)
+        "--consistency-runs=5",
+    ).assert_outcomes(passed=1)
 
 
 def test_runs_from_the_command_line(session):
-    make(
+    run(
         session,
         "@pytest.mark.consistency(detect=2.0)\n"
         "def test_it(consistency_runs):\n"
         "    assert consistency_runs == 500\n"
         "    gate(nees(consistency_runs))",
-    )
-    session.runpytest("--consistency-runs=500").assert_outcomes(passed=1)
+        "--consistency-runs=500",
+    ).assert_outcomes(passed=1)
 
 
 def test_a_marker_with_other_arguments(session):
-    make(session, "@pytest.mark.consistency(3, runs=7)\ndef test_it():\n    pass")
-    result = session.runpytest()
+    result = run(session, "@pytest.mark.consistency(3, runs=7)\ndef test_it():\n    pass")
     result.assert_outcomes(errors=1)
     result.stdout.fnmatch_lines(["marker consistency: takes dof, detect, * as keywords, got 3, runs"])
 
@@ -378,8 +382,11 @@ def test_the_budget_of_the_ini_file(session):
 
 
 def test_what_is_certain_fails_in_place(session):
-    make(session, "def test_it(consistency_runs):\n    gate(nees(consistency_runs, 3.0))\n    open('went on', 'w')")
-    result = session.runpytest("--consistency-false-alarm=1e-3")
+    result = run(
+        session,
+        "def test_it(consistency_runs):\n    gate(nees(consistency_runs, 3.0))\n    open('went on', 'w')",
+        "--consistency-false-alarm=1e-3",
+    )
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["E *ConsistencyError*"])
     assert not (session.path / "went on").exists()
@@ -387,20 +394,26 @@ def test_what_is_certain_fails_in_place(session):
 
 def test_planned_runs_suffice_for_the_budget(session):
     """Twenty gates in one test are as many as the plan allows for."""
-    make(session, "def test_it(consistency_runs):\n    for _ in range(20):\n        gate(nees(consistency_runs))")
-    session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=1)
+    run(
+        session,
+        "def test_it(consistency_runs):\n    for _ in range(20):\n        gate(nees(consistency_runs))",
+        "--consistency-false-alarm=1e-3",
+    ).assert_outcomes(passed=1)
 
 
 def test_what_is_shown_passes_at_any_share_of_the_budget(session):
     """That a filter is right is shown at a rate that no budget divides: fewer runs than planned may do."""
     runs = gate_runs(3, 1.5, 1e-3, 0.95)
-    make(session, f"@pytest.mark.parametrize('i', range(4))\ndef test_it(i):\n    gate(nees({runs} - 9 * i))")
-    session.runpytest("--consistency-false-alarm=1e-3").assert_outcomes(passed=4)
+    run(
+        session,
+        f"@pytest.mark.parametrize('i', range(4))\ndef test_it(i):\n    gate(nees({runs} - 9 * i))",
+        "--consistency-false-alarm=1e-3",
+    ).assert_outcomes(passed=4)
 
 
 def test_too_few_to_compare_can_show_at_the_end(session):
     """Enough for the whole budget, too few for a fifth of it."""
-    make(
+    result = run(
         session,
         "values = np.random.default_rng(0).chisquare(3, (2, 400, 1))\n"
         "@pytest.mark.parametrize('i', range(5))\n"
@@ -409,22 +422,21 @@ def test_too_few_to_compare_can_show_at_the_end(session):
         "    assert_not_worse(nees_a=values[0, :runs], nees_b=values[1, :runs], dof=3, detect=2.0)\n"
         "FEW = next(n for n in range(8, 400) if "
         "compare(*(summary(v[:n], 3) for v in values), 1e-3).needed_runs(2.0, 0.95) <= n)\n",
+        "--consistency-false-alarm=1e-3",
     )
-    result = session.runpytest("--consistency-false-alarm=1e-3")
     result.assert_outcomes(passed=4, failed=1)
     result.stdout.fnmatch_lines(["*is not found worse, but * runs are too few to pass: *"])
 
 
 def test_too_few_to_decide_fail_in_place(session):
     """And asks for the number that will do."""
-    make(session, "def test_it():\n    gate(nees(8))")
-    result = session.runpytest("--consistency-false-alarm=1e-3")
+    result = run(session, "def test_it():\n    gate(nees(8))", "--consistency-false-alarm=1e-3")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines([f"E *Simulate {gate_runs(3, 1.5, in_place_rate(1e-3, 1), 0.95)} runs*"])
 
 
 def test_a_gate_that_a_test_expects_to_fail_stays_so(session):
-    make(
+    result = run(
         session,
         "def test_it(consistency_runs):\n"
         "    with pytest.raises(ConsistencyError):\n"
@@ -432,22 +444,22 @@ def test_a_gate_that_a_test_expects_to_fail_stays_so(session):
         "@pytest.mark.xfail\n"
         "def test_known(consistency_runs):\n"
         "    gate(nees_with(1e-4, consistency_runs))\n",
+        "--consistency-false-alarm=1e-3",
     )
-    result = session.runpytest("--consistency-false-alarm=1e-3")
     result.assert_outcomes(passed=1, xpassed=1)
     assert result.ret == 0
 
 
 def test_many_gates_wait_for_the_end(session):
     """From the eleventh on nothing fails in place; 25 gates, so the first ten have had half the budget."""
-    make(
+    result = run(
         session,
         "def test_it():\n"
         "    for i in range(25):\n"
         "        gate(nees(300, 3.0 if i >= 20 else 1.0))\n"
         "    open('went on', 'w').close()",
+        "--consistency-false-alarm=1e-3",
     )
-    result = session.runpytest("--consistency-false-alarm=1e-3")
     result.assert_outcomes(failed=1)
     assert (session.path / "went on").exists()
     result.stdout.fnmatch_lines(["25 gates, 5 failed; * at most 0.001 (budget 0.001: 3.33e-05 for a gate)"])
@@ -487,9 +499,10 @@ def test_a_second_try_replaces_the_first(session):
         "    runtestprotocol(item, nextitem=nextitem)\n"
         "    return True\n"
     )
-    make(
-        session, "tries = []\ndef test_it():\n    tries.append(1)\n    gate(nees(102, 2.0 if len(tries) < 2 else 1.0))"
+    result = run(
+        session,
+        "tries = []\ndef test_it():\n    tries.append(1)\n    gate(nees(102, 2.0 if len(tries) < 2 else 1.0))",
+        "--consistency-report=gates.json",
     )
-    result = session.runpytest("--consistency-report=gates.json")
     result.assert_outcomes(passed=1)
     assert [each["outcome"] for each in gates_of(session.path)] == ["passed"]

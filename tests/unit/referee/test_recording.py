@@ -73,20 +73,6 @@ vector3 = st.tuples(coordinate, coordinate, coordinate).map(np.array)
 turn3 = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(lambda values: np.round(values, 9))
 
 
-@few
-@given(x=coordinate, y=coordinate, heading=angle)
-def test_se2_log_is_the_matrix_logarithm(x, y, heading):
-    pose = np.array([x, y, heading])
-    assert_allclose(se2_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-9)
-
-
-@few
-@given(position=vector3, turn=turn3)
-def test_se3_log_is_the_matrix_logarithm(position, turn):
-    pose = spatial(position, turn)
-    assert_allclose(se3_log(pose), vee(np.real(logm(matrix(pose)))), atol=1e-8)
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.00999, 0.01001, 0.1, 1.0, 3.0, 3.14159, np.pi - 1e-9])
 def test_log_undoes_the_exponential_at_every_angle(size):
     """Also across the switch to the series, and near pi, where eq. 146 as printed divides zero by zero."""

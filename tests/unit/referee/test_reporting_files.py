@@ -33,6 +33,13 @@ def errors_of(rng, n=2, ratio=1.0):
     return {"errors": errors, "covariances": np.broadcast_to(P, (RUNS, STEPS, n, n)).copy()}
 
 
+def pictured(folder, **arrays):
+    """The record of an archive of these arrays, and its figures by title."""
+    np.savez(folder / "e.npz", **arrays)
+    record = cs.read(folder / "e.npz")
+    return record, {of.title: of for of in record_figures(record, cs.judge(record))}
+
+
 @pytest.fixture
 def archive(tmp_path, rng):
     np.savez(tmp_path / "mine.npz", **errors_of(rng), axes=["x", "yaw"], t=1.7e9 + 0.1 * np.arange(STEPS))
@@ -137,18 +144,11 @@ def test_the_longest_run_is_shown(tmp_path, rng):
 
 
 def test_a_single_run_has_a_nees_and_no_other_runs(tmp_path, rng):
-    np.savez(tmp_path / "e.npz", **{key: value[0] for key, value in errors_of(rng).items()})
-    record = read_recordings(tmp_path / "e.npz")[0]
-    found = record_figures(record, cs.judge(cs.read(tmp_path / "e.npz")))
-    assert found[0].caption.startswith("NEES; 2 is expected")
-    assert legend_of(panels(found[1])[0].figure) == ["2-sigma bounds", "run 0"]
-    assert [of.title for of in found] == [
-        "NEES",
-        "Errors and stated bounds",
-        "Coverage",
-        "Errors over their stated sigma",
-    ]
-    assert legend_of(panels(found[3])[0].figure) == ["2 sigma", "run 0"]
+    _, found = pictured(tmp_path, **{key: value[0] for key, value in errors_of(rng).items()})
+    assert list(found) == ["NEES", "Errors and stated bounds", "Coverage", "Errors over their stated sigma"]
+    assert found["NEES"].caption.startswith("NEES; 2 is expected")
+    assert legend_of(panels(found["Errors and stated bounds"])[0].figure) == ["2-sigma bounds", "run 0"]
+    assert legend_of(panels(found["Errors over their stated sigma"])[0].figure) == ["2 sigma", "run 0"]
 
 
 def test_the_nees_is_drawn_between_the_bands_of_a_right_filter(archive):
@@ -168,10 +168,8 @@ def test_the_nees_is_drawn_between_the_bands_of_a_right_filter(archive):
 def test_the_worst_run_is_named_and_drawn(tmp_path, rng):
     data = errors_of(rng)
     data["errors"][7] *= 5.0
-    np.savez(tmp_path / "e.npz", **data)
-    record = cs.read(tmp_path / "e.npz")
-    worst = next(of for of in record_figures(record, cs.judge(record)) if of.title == "Which run, and when")
-    of_runs, of_steps = panels(worst)
+    record, found = pictured(tmp_path, **data)
+    of_runs, of_steps = panels(found["Which run, and when"])
     assert of_steps.get_ylabel() == "NEES of run 7"
     assert_allclose(places(of_runs)[0][:, 1], record.errors.nees.mean(axis=1))
     assert_allclose(places(of_runs)[1], [[7.0, record.errors.nees[7].mean()]])
@@ -183,9 +181,7 @@ def test_the_first_steps_set_no_axis(tmp_path, rng):
     usual = np.abs(data["errors"]).max()
     data["errors"][:, :2] *= 1000.0
     data["covariances"] = data["covariances"] * np.where(np.arange(STEPS) < 2, 1e6, 1.0)[:, None, None]
-    np.savez(tmp_path / "e.npz", **data)
-    record = cs.read(tmp_path / "e.npz")
-    found = {of.title: of for of in record_figures(record, cs.judge(record))}
+    _, found = pictured(tmp_path, **data)
     assert panels(found["Errors and stated bounds"])[0].get_ylim()[1] < 10.0 * usual
     assert panels(found["Errors over their stated sigma"])[0].get_ylim()[1] < 10.0
 
@@ -194,9 +190,8 @@ def test_runs_of_one_step_stand_side_by_side(tmp_path, rng):
     """A factor or a calibration: no curve along the steps, which would be a point."""
     errors = rng.normal(size=(RUNS, 1, 2))
     covariances = np.broadcast_to(np.diag([0.25, 4.0]), (RUNS, 1, 2, 2))
-    np.savez(tmp_path / "e.npz", errors=errors, covariances=covariances, axes=["x", "yaw"])
-    record = cs.read(tmp_path / "e.npz")
-    of_nees, of_errors, _ = record_figures(record, cs.judge(record))
+    _, found = pictured(tmp_path, errors=errors, covariances=covariances, axes=["x", "yaw"])
+    of_nees, of_errors, _ = found.values()
     for axes, factor, sigma, error in zip(
         panels(of_errors), (1.0, 180 / np.pi), (0.5, 2.0), errors[:, 0].T, strict=True
     ):
@@ -304,8 +299,7 @@ def test_a_file_that_analyse_has_written_is_replaced(archive, tmp_path, capsys):
     consistency(capsys, "analyse", archive, "--report", report, "--overwrite")
 
 
-def test_what_a_report_is_not_for(archive, tmp_path, capsys):
-    assert "--overwrite goes with --report" in refused(capsys, "analyse", archive, "--overwrite")
+def test_results_of_the_bench_have_another_report(tmp_path, capsys):
     scenario = cs.load_scenario("linear-gaussian").variant("short", truth__steps=5)
     cs.run_trials(scenario, ["kf"], runs=2, jobs=1).write(tmp_path / "results")
     _, err = consistency(capsys, "analyse", tmp_path / "results", "--report", tmp_path / "r", status=2)

@@ -29,7 +29,6 @@ from consistency.referee.show.blocks import (
     Figure,
     Status,
     Text,
-    badges,
 )
 from consistency.referee.show.figures import canvas, drawn
 from consistency.referee.verdicts.monitor_sources import make_monitor, watch
@@ -45,14 +44,6 @@ def bounded(scale=1.0, runs=400, steps=20):
 
 
 # --- badges -------------------------------------------------------------------------------------------------------
-
-
-def test_a_verdict_has_its_word_alone_some_have_their_names_and_many_are_counted():
-    assert badges([("kf", "consistent")]) == (Status("consistent"),)
-    two = [("a", "failed"), ("b", "consistent")]
-    assert badges(two) == (Status("failed", " a"), Status("consistent", " b"))
-    assert badges(two * 4) == (Status("failed", " 4"), Status("consistent", " 4"))
-    assert badges([]) == ()
 
 
 def test_the_badge_stands_above_the_sentence():

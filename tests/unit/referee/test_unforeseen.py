@@ -64,7 +64,7 @@ def test_a_programming_error_of_ours_is_not_reworded(kind):
     names = {"KIND": kind}
     exec(code, names)
     with pytest.raises(kind, match="ours"), reading("file"):
-        names["parse"]()  # type: ignore[operator]
+        names["parse"]()
 
 
 @pytest.mark.parametrize("kind", [TypeError, AttributeError, NameError, IndexError, ValueError])

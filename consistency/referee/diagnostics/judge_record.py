@@ -65,7 +65,7 @@ def judge(
         return follow(design, record.first_runs, len(record.run_numbers), kept)[0]
     if record.guesses:
         return _judge_conventions(record, settings, kept)
-    if record.errors.bounds:
+    if record.errors.bounded:
         from consistency.referee.diagnostics.bounds import findings_of_bounds
 
         return _whole(record, findings_of_bounds(record, settings), kept)

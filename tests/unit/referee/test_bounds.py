@@ -21,7 +21,7 @@ from consistency.referee.diagnostics.exceedance import (
     level_of,
     missing_steps,
 )
-from consistency.referee.diagnostics.record import Bound, Errors, Record, skip_of
+from consistency.referee.diagnostics.record import Bound, BoundErrors, Errors, Record, skip_of
 from consistency.referee.diagnostics.verdict import plain
 from consistency.referee.readers.formats.bounds import bound_columns, level_of_text, levels_of
 from consistency.testing import ConsistencyError, InsufficientTrials, assert_consistent
@@ -316,7 +316,7 @@ def test_a_verdict_is_a_dictionary_and_text():
 
 
 def test_a_record_of_bounds_has_runs_and_can_be_cut():
-    record = Record("r", Errors(bounds=(Bound("bound_x", ("x",), 0.95),), bound_ratios=errors() / 1.96))
+    record = Record("r", Errors(bounded=BoundErrors((Bound("bound_x", ("x",), 0.95),), errors() / 1.96)))
     assert len(record.run_numbers) == 400
     assert judge(record, Settings()).consistent
     assert judge(record.first_runs(10), Settings()).runs == 10
@@ -380,8 +380,8 @@ def test_a_truth_of_its_own_and_a_heading_that_wraps(tmp_path):
         text = "\n".join(",".join(map(repr, map(float, [*row, *[0.1] * bool(more)]))) for row in rows)
         (tmp_path / f"{name}.csv").write_text(f"run,step,x,y,heading{more}\n{text}\n")
     record = cs.read(tmp_path / "est.csv", tmp_path / "truth.csv", level="95%")
-    assert_allclose(record.errors.bound_ratios.ravel(), e / 0.1, rtol=1e-6)
-    assert record.errors.bounds == (Bound("bound_heading", ("heading",), 0.95),)
+    assert_allclose(record.errors.bounded.ratios.ravel(), e / 0.1, rtol=1e-6)
+    assert record.errors.bounded.bounds == (Bound("bound_heading", ("heading",), 0.95),)
 
 
 def test_archives_hold_bounds(tmp_path):

@@ -153,7 +153,7 @@ def test_errors_over_bounds_are_those_of_the_record():
     figure = next(f for f in record_figures(record, verdict) if f.title == "Errors over their bounds")
     for number, axes in enumerate(drawn(figure.drawings[0]).axes):
         shown = next(line for line in axes.lines if line.get_label() == "run 0")
-        assert_allclose(shown.get_ydata(), record.errors.bound_ratios[0, :, number])
+        assert_allclose(shown.get_ydata(), record.errors.bounded.ratios[0, :, number])
         (span,) = (patch for patch in axes.patches if patch.get_label() == "inside the bound")
         assert (span.get_y(), span.get_y() + span.get_height()) == (-1.0, 1.0)
 

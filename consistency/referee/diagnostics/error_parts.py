@@ -99,7 +99,10 @@ def error_parts(
 ) -> ErrorParts:
     """All parts of the errors of a sample; those of NEES alone have no components."""
     faults = set(faults_of(given))
-    band = _band_of_fault(sample, tests, faults, settings)
+    band = tests.band
+    if STEP in faults and not band.outside.any():  # found by what Holm's correction left over: a band that shows it
+        rate = np.nextafter(band.p_value, 1.0) * (1 + 1e-6)
+        band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, faults, ordered=record.map.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown, faults)
@@ -117,14 +120,6 @@ def error_parts(
         accuracy_of(sample),
         by_group,
     )
-
-
-def _band_of_fault(sample: Sample, tests: Tests, faults: set[str], settings: Settings) -> Band:
-    """The band of the steps; where they were found by what Holm's correction left over, one that shows it."""
-    if STEP not in faults or tests.band.outside.any():
-        return tests.band
-    rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
-    return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
 
 
 def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Settings) -> tuple[Answer, ...]:

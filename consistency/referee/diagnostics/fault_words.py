@@ -219,19 +219,14 @@ def _axes_text(v: Findings) -> str:
         off |= _wrong(v, -1)
     largest = v.axes.largest
     if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in off.values()):
-        return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
+        u = v.axes.direction  # of errors in stated standard deviations
+        assert u is not None
+        u = u * np.sign(u[np.argmax(np.abs(u))])
+        named = [f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED_PART]
+        return f"covariance {off_by(largest)} in the direction {' '.join(named)}"
     if not off:
         return "covariance wrong in an axis"
     return f"covariance {_sizes_in_axes(off)}{since_text(v)}"
-
-
-def _direction_text(v: Findings) -> str:
-    """The worst direction, of errors in stated standard deviations."""
-    assert v.axes is not None
-    assert v.axes.direction is not None
-    u = v.axes.direction
-    u = u * np.sign(u[np.argmax(np.abs(u))])
-    return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED_PART)
 
 
 def _sizes_in_axes(off: dict[str, Interval]) -> str:
@@ -364,19 +359,15 @@ def joint_text(v: Findings, joint: JointScore) -> str:
     elif map_is_wrong and not pose_is_wrong:
         part = ", mainly the map given the pose"
     if joint.chief and not pose_is_wrong:
-        part += f" ({_chief_landmarks(joint.chief)})"
+        text = f"most in landmarks {', '.join(map(str, joint.chief[:MOST]))}"
+        if len(joint.chief) == 1:
+            text = f"most in landmark {joint.chief[0]}"
+        elif len(joint.chief) > MOST:
+            text += f" and {len(joint.chief) - MOST} more"
+        part += f" ({text})"
     if SIDES.get(v.status, 0) * (joint.both.value - 1.0) < 0.0:
         return f"pose and map together: the {v.unit}s differ more than Gaussian errors would{part}"
     return f"pose and map together: covariance {off_by(joint.both)}{part}"
-
-
-def _chief_landmarks(chief: tuple[int, ...]) -> str:
-    if len(chief) == 1:
-        return f"most in landmark {chief[0]}"
-    text = f"most in landmarks {', '.join(str(label) for label in chief[:MOST])}"
-    if len(chief) > MOST:
-        text += f" and {len(chief) - MOST} more"
-    return text
 
 
 def fault_sentence(v: Findings, s: Scale) -> str:

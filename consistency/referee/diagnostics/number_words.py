@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from consistency.referee.diagnostics.verdict import Findings
-from consistency.referee.diagnostics.verdict_parts import TINY, Interval
+from consistency.referee.diagnostics.verdict_parts import TINY, Equivalence, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 SIDE = len("too small")  # or "too large", with which :func:`off_by` begins
@@ -70,6 +70,13 @@ def since_text(v: Findings) -> str:
     if where.until is None:
         return f" since {v.place(where.since)}"
     return f" in {v.place(where.since, where.until.step)}"
+
+
+def between_text(shown: Equivalence) -> str:
+    """Where a ratio is shown to be, or should be: "between 0.67 and 1.50", or "below 1.50"."""
+    if shown.one_sided:
+        return f"below {short(shown.factor)}"
+    return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
 
 
 def p_text(p: float) -> str:

@@ -36,7 +36,6 @@ from consistency.referee.diagnostics.verdict_parts import (
     Shape,
     Tails,
     TruthShare,
-    Within,
     faults_of,
 )
 from consistency.referee.errors import InputError
@@ -323,10 +322,6 @@ def _axes_numbers(v: Verdict, axes: ComponentRatios) -> dict[str, Any]:
     return numbers
 
 
-def _guess_numbers(guesses: Mapping[str, ConventionResult]) -> dict[str, Any]:
-    return {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}
-
-
 def _map_numbers(score: MapScore) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "map_ratio": score.ratio.value,
@@ -374,7 +369,7 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
         (v.rejection, rejection_numbers),
         (v.ends, ends_numbers),
         (v.skipped, skipped_numbers),
-        (v.guesses or None, _guess_numbers),
+        (v.guesses or None, lambda guesses: {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}),
         (v.truth, truth_numbers),
         (v.by_group, group_numbers),
         (v.bounds or None, bound_numbers),
@@ -393,6 +388,16 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
 
 
 def scale_numbers(scale: Scale) -> Numbers:
+    within: Numbers | None = None
+    if scale.within is not None:
+        within = {
+            "ratio": scale.within.ratio.value,
+            "ratio_interval": tuple(scale.within.ratio[1:]),
+            "correlation_steps": scale.within.correlation,
+            "effective_dof": scale.within.effective_dof,
+            "deciding_steps": scale.within.steps,
+            "deciding_pieces": scale.within.pieces,
+        }
     return {
         "dof": scale.dof,
         "anees": scale.anees,
@@ -409,20 +414,7 @@ def scale_numbers(scale: Scale) -> Numbers:
         "worst_run": scale.worst_run,
         "share_inside": scale.share_inside,
         "equivalence": equivalence_numbers(scale.equivalence),
-        "within": _of_within(scale.within),
-    }
-
-
-def _of_within(within: Within | None) -> Numbers | None:
-    if within is None:
-        return None
-    return {
-        "ratio": within.ratio.value,
-        "ratio_interval": tuple(within.ratio[1:]),
-        "correlation_steps": within.correlation,
-        "effective_dof": within.effective_dof,
-        "deciding_steps": within.steps,
-        "deciding_pieces": within.pieces,
+        "within": within,
     }
 
 

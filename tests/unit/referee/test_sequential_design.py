@@ -13,7 +13,6 @@ from scipy import integrate, stats
 
 from consistency.diagnostics import (
     Design,
-    Verdict,
     e_process,
     ever,
     follow,
@@ -26,6 +25,7 @@ from consistency.referee.diagnostics import judge_record
 from consistency.referee.diagnostics import nees as betting
 from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.scale import equivalence, equivalence_by_betting
+from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.types import Failure
 
 SURE = 1e-5
@@ -260,13 +260,13 @@ def test_a_later_look_does_not_overwrite_a_decision(monkeypatch):
     calls = []
     script = {("early", 12): "overconfident", ("late", 24): "conservative"}
 
-    def verdict_at(design, evidence, spent):
+    def findings_at(evidence, settings, inspection):
         runs = len(evidence.run_numbers)
         calls.append((evidence.name, runs))
         status = script.get((evidence.name, runs), "consistent" if evidence.name == "early" else "undecided")
-        return Verdict(evidence.name, status, runs, 1, design.settings, reasons=(f"{status}: at {runs}",))
+        return Findings(evidence.name, status, runs, 1, settings)
 
-    monkeypatch.setattr(judge_record, "look", verdict_at)
+    monkeypatch.setattr(judge_record, "findings_of", findings_at)
     monkeypatch.setattr(judge_record, "speaks", lambda design, evidence, spent: spent is not None)
     verdicts = {}
 

@@ -15,6 +15,7 @@ from consistency.referee.diagnostics.number_words import (
     MOST,
     SIDE,
     SMALLEST_P,
+    first_few,
     is_or_are,
     is_uncertain,
     names_in_a_row,
@@ -560,10 +561,8 @@ def right_groups(v: Findings) -> str:
     """What is shown of the groups of the whole, or of each part, where none is at fault."""
     if v.by_group is not None:
         return f"; {_without_fault(v.by_group)}"
-    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
-    return "".join(texts)
+    texts = [f"{name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    return "; ".join(["", *first_few(texts)])
 
 
 def _without_fault(by: ByGroup) -> str:

@@ -107,6 +107,13 @@ def names_in_a_row(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
+def first_few(texts: Sequence[str]) -> list[str]:
+    """The first of the texts, and then how many more there are."""
+    if len(texts) <= MOST:
+        return list(texts)
+    return [*texts[:MOST], f"and {len(texts) - MOST} more"]
+
+
 def with_subject(name: str, sentence: str) -> str:
     """The sentence of a verdict on something of that name: "ekf is consistent: ...", or "ekf failed: ..."."""
     if sentence.startswith("failed"):

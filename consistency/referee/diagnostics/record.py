@@ -512,7 +512,7 @@ def shown_by(function: str, *arguments: Any) -> Any:
 
 def arrays_of(record: Record) -> dict[str, Any]:
     """Arrays over runs that a record has, by the name of their value and their own: "errors.nees"."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for part in ("errors", "innovations", "runs", "truth", "origin"):
         arrays |= _arrays(getattr(record, part), part)
     return arrays

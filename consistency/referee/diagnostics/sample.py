@@ -47,18 +47,6 @@ class Centre(NamedTuple):
         return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
 
 
-class InGroup(NamedTuple):
-    """Runs that have a step in a group."""
-
-    means: Array  # (runs,), mean NEES over dof of their steps there
-    counts: Indices  # (runs,), of these steps
-
-    @property
-    def longest(self) -> int:
-        """Steps of the run that has most."""
-        return int(self.counts.max(initial=0))
-
-
 @dataclass(frozen=True)
 class Sample:
     """NEES of N runs in T steps; where errors of n components are known, these in units of their covariance.
@@ -113,15 +101,15 @@ class Sample:
         means, counts = run_means(self.nees[:, steps])
         return np.asarray(means[counts > 0] / self.dof)
 
-    def in_group(self, number: int) -> InGroup:
-        """The runs that have a step in a group."""
+    def in_group(self, number: int) -> RunMeans:
+        """Mean NEES over their steps in a group of the runs that have any."""
         assert self.groups is not None
 
         def of_block(nees: Array, index: Indices) -> Array:
             return means_and_counts(np.where(index == number, nees, np.nan))
 
         means, counts = by_runs(of_block, self.nees, self.groups.index).T
-        return InGroup(np.asarray(means[counts > 0] / self.dof), counts[counts > 0].astype(np.int64))
+        return RunMeans(means[counts > 0] / self.dof, counts[counts > 0].astype(np.int64), self.dof)
 
     @cached_property
     def counts(self) -> Indices:

@@ -10,8 +10,8 @@ import numpy as np
 from consistency.referee.diagnostics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.number_of_runs import FEWEST_PLANNED
 from consistency.referee.diagnostics.number_words import (
-    MOST,
     between_text,
+    first_few,
     is_or_are,
     is_uncertain,
     p_text,
@@ -72,15 +72,13 @@ def _faults_of_parts(v: Findings) -> str:
         if not part.faults:
             continue
         part = replace(part, failures=())  # which are those of the whole
-        since = None if part.location is None else part.location.since
-        if v.axes is not None and name in v.axes.names and part.scale is not None and since is None:
+        begins_late = part.location is not None and part.location.since is not None
+        if v.axes is not None and name in v.axes.names and part.scale is not None and not begins_late:
             # the whole states a ratio of that axis, too, with intervals that hold at once
             part = replace(part, scale=replace(part.scale, inflation=v.axes.inflation[name]))
         sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
         texts.append(f"{name}: {sentence}")
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
-    return "; ".join(texts)
+    return "; ".join(first_few(texts))
 
 
 def details(v: Findings) -> list[str]:
@@ -90,9 +88,20 @@ def details(v: Findings) -> list[str]:
         lines.append(
             f"noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB (0 if right)"
         )
-    if v.answers:
-        lines.append(_questions(v))
-    return lines
+    if not v.answers:
+        return lines
+    text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
+    if len(v.answers) > 1:
+        text += " together"
+    if not v.faults:
+        least = min(v.answers, key=lambda answer: answer.adjusted)
+        nearest = f"{question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
+        return [*lines, f"{text}; nearest to a fault: {nearest}"]
+    found = []
+    for answer in v.answers:
+        if answer.question in v.faults:
+            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
+    return [*lines, f"{text}; found: {', '.join(found)}"]
 
 
 def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
@@ -490,20 +499,6 @@ def _nis(i: Innovations) -> str:
     if len(i.autocorrelation):
         text += f", autocorrelation {i.autocorrelation[0]:+.3f} at lag 1 (within {i.bound:.3f} expected)"
     return text
-
-
-def _questions(v: Findings) -> str:
-    text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
-    if len(v.answers) > 1:
-        text += " together"
-    if not v.faults:
-        least = min(v.answers, key=lambda answer: answer.adjusted)
-        return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
-    found = []
-    for answer in v.answers:
-        if answer.question in v.faults:
-            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
-    return f"{text}; found: {', '.join(found)}"
 
 
 def question_text(v: Findings, question: str) -> str:

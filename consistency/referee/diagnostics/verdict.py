@@ -16,6 +16,7 @@ import numpy as np
 from consistency.referee.diagnostics.record import Record, Skipped, shown_by
 from consistency.referee.diagnostics.verdict_parts import (
     REGIONS,
+    SIDES,
     TINY,
     Accuracy,
     Answer,
@@ -122,24 +123,16 @@ class Findings:
         """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
         if self.axes is None or len(self.axes.names) < 2:
             return None
-        side = 0.0
-        if self.status == "overconfident":
-            side = 1.0
-        elif self.status == "conservative":
-            side = -1.0
-        elif self.settings.one_sided:
-            side = 1.0
-        worst = None
-        farthest = -np.inf
-        for axis, interval in self.axes.inflation.items():
-            log = float(np.log(max(interval.value, TINY)))
-            if axis not in self.axes.names or not np.isfinite(log):
-                continue
-            distance = side * log if side else abs(log)
-            if distance > farthest:
-                worst = (axis, interval)
-                farthest = distance
-        return worst
+        side = SIDES.get(self.status, int(self.settings.one_sided))
+        distances = {}
+        for axis in self.axes.names:
+            log = float(np.log(max(self.axes.inflation[axis].value, TINY)))
+            if np.isfinite(log):
+                distances[axis] = side * log if side else abs(log)
+        if not distances:
+            return None
+        worst = max(distances, key=distances.__getitem__)
+        return worst, self.axes.inflation[worst]
 
     @property
     def faults(self) -> tuple[str, ...]:

@@ -590,7 +590,10 @@ def shares_of(questions: Collection[str]) -> dict[str, float]:
 
 def at_share(given: Sequence[Answer], settings: Settings) -> Settings:
     """Settings at whose usual share the scale is asked as it was: at the whole rate where nothing else is asked."""
-    share = next((answer.share for answer in given if answer.question == MAIN), SHARES[MAIN])
+    share = SHARES[MAIN]
+    for answer in given:
+        if answer.question == MAIN:
+            share = answer.share
     return replace(settings, false_alarm=min(settings.false_alarm * share / SHARES[MAIN], CERTAIN))
 
 

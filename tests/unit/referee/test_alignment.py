@@ -1,7 +1,6 @@
 """Files in a world of their own: frames that are found, errors that are left, and verdicts on them."""
 
 import itertools
-import json
 
 import numpy as np
 import pandas as pd
@@ -593,14 +592,6 @@ def _ahead(p, seconds):
 
 
 # --- the command ----------------------------------------------------------------------------------------------
-
-
-def test_the_command_says_what_was_aligned(tmp_path, rng):
-    files = tables(tmp_path, rng, 24, 1.0, "all")
-    done = CliRunner().invoke(app, ["analyse", *files, "--align", "posyaw-all", "--json"])
-    assert done.exit_code == 0
-    assert "aligned by posyaw-all: turned by (0, 0, -126" in done.stderr
-    assert json.loads(done.stdout)["est"]["statistics"]["align"] == "posyaw-all"
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from consistency.diagnostics import (
     identity_statistic,
     make_record,
     mean_shape,
+    nis_test,
     noncredibility,
     pit,
     power_of,
@@ -385,6 +386,14 @@ def test_portmanteau_of_one_series_is_that_of_statsmodels(fresh):
     assert found.statistic == pytest.approx(table["lb_stat"].iloc[-1] * 500 / 502)
     assert table["bp_stat"].iloc[-1] < found.statistic < table["lb_stat"].iloc[-1]
     assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, 10))
+
+
+def test_total_nis_by_hand():
+    nis, dof = np.array([[3.0, np.nan, 8.0]]), np.array([[2, 0, 6]])
+    test = nis_test(nis, dof)
+    assert (test.ratio, test.dof) == (11.0 / 8.0, 8)
+    assert test.above == pytest.approx(stats.chi2.sf(11.0, 8))
+    assert test.p_value == pytest.approx(2 * stats.chi2.sf(11.0, 8))
 
 
 # --- credibility ---------------------------------------------------------------------------------------

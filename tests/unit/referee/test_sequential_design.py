@@ -307,10 +307,6 @@ def mean_of_a_bet(side, n, ratio=1.0, kink=1.0):
     return mean
 
 
-def test_the_stakes_are_these():
-    assert [("up", s) for s in betting.UP] + [("down", s) for s in betting.DOWN] == STAKES
-
-
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 @pytest.mark.parametrize("side, stake", STAKES)
 def test_every_bet_is_fair(monkeypatch, side, stake, n):

@@ -108,13 +108,6 @@ def test_a_long_log_is_to_be_cut(rng):
     assert judge(of(cut), Settings(SURE)).consistent
 
 
-def test_several_runs_have_no_such_line(rng):
-    e = errors(rng, 0.5, 400, 3).reshape(2, 200, 3)
-    verdict = judge(of(e), Settings(SURE))
-    assert verdict.scale.within is None
-    assert not any("decorrelate" in reason for reason in verdict.reasons)
-
-
 def poses(path, e):
     step = np.arange(1, len(e) + 1)
     truth = pd.DataFrame({"step": step, "x": 0.1 * step, "y": 0.0, "heading": 0.0})
@@ -428,12 +421,3 @@ def test_runs_that_end_lost_are_named_and_others_are_not(rng):
         found = early_ends(np.where(np.arange(20) < length[:, None], nees, np.nan))
         lost += found.lost
     assert lost <= stats.binom.isf(SURE, 60, 2e-3)
-
-
-def test_ends_with_small_errors_are_no_matter(rng):
-    nees = runs(rng, 100, 20)
-    nees[np.argsort(nees[:, 9])[:30], 10:] = np.nan
-    found = early_ends(nees)
-    assert (found.runs, found.lost) == (30, False)
-    assert found.above < 0.2
-    assert found.p_value > 0.999

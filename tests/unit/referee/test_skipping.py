@@ -97,15 +97,6 @@ def test_steps_keep_their_numbers(errors):
     assert fault.value.verdict.first_step == 23
 
 
-@pytest.mark.parametrize("given", ["2.5s", "5"])
-def test_files_by_seconds_or_steps(given, archive):
-    """Steps are half a second apart."""
-    verdict = cs.judge(cs.read(archive), skip=given)
-    assert verdict.statistics["skipped_steps"] == 5
-    assert np.isnan(verdict.statistics["anees"][:5]).all()
-    assert np.isfinite(verdict.statistics["anees"][5:]).all()
-
-
 def test_tables_have_times_of_each_run(tmp_path):
     """Two days, which share no clock: seconds count from the first estimate of each."""
     head = "run,t,a,P_a_a\n"

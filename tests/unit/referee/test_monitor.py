@@ -69,15 +69,6 @@ def test_no_scale_within_the_tolerance_is_bet_against_with_profit(dof, tolerance
         assert expectation(ratio, beyond, dof, limit) > 1.0 + 1e-6
 
 
-def test_alternatives_are_outside_the_tolerance_on_both_sides():
-    for tolerance in (1.0, 1.2, 3.0):
-        pairs = alternatives(tolerance)
-        above, below = pairs[: len(RATIOS)], pairs[len(RATIOS) :]
-        assert all(edge == tolerance and scale > tolerance for scale, edge in above)
-        assert all(edge == 1 / tolerance and scale < 1 / tolerance for scale, edge in below)
-        np.testing.assert_allclose([a * b for (a, _), (b, _) in zip(above, below, strict=True)], 1.0)
-
-
 def test_shares_add_up_to_one():
     terms = 10**6
     head = math.fsum(start_share(k) for k in range(1, terms + 1))

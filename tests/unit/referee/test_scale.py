@@ -6,7 +6,7 @@ limits at 1e-5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -74,15 +74,11 @@ def gamma_shape(means):
     return float(best.x), float(1.0 / np.sqrt((curve[0] - 2.0 * curve[1] + curve[2]) / h**2))
 
 
-@dataclass(frozen=True)
-class Oracle:
+class Oracle(NamedTuple):
     nu: float
     spread: float
-    by_spread: float  # log nu, one standard error to the safe side, at a mean of 1
-    by_likelihood: float
-    shift: float  # to the mean of 1, before the limit at 0
-    clipped: bool  # the mean is farther from 1 than chance carries it
-    floored: bool  # the variance is below 2 / N
+    by_spread: float = 0.0  # log nu, one standard error to the safe side, at a mean of 1
+    by_likelihood: float = 0.0
 
 
 def at_most_skewness(log_nu, mean, dof):
@@ -100,10 +96,8 @@ def oracle(means, dof, steps, gaussian=True):
     left_out, log_mean = [log_nu_of_spread(m) for m in without], [float(np.log(m.mean())) for m in without]
     of_mean, both = covariance_of_left_out(log_mean, log_mean), covariance_of_left_out(left_out, log_mean)
     slope, reach = both / of_mean, 4.0 * np.sqrt(of_mean)
-    distance = float(np.log(means.mean()))
-    shift = -slope * min(max(distance, -reach), reach)
-    unfloored = covariance_of_left_out(left_out, left_out) - slope * both
-    variance = max(unfloored, 2.0 / N)
+    shift = -slope * min(max(float(np.log(means.mean())), -reach), reach)
+    variance = max(covariance_of_left_out(left_out, left_out) - slope * both, 2.0 / N)
     cv2 = means.var(ddof=1) / means.mean() ** 2
     at_one = log_nu_of_spread(means) - np.log1p(cv2 / N) + min(shift, 0.0)
     by_spread = at_most_skewness(at_one, float(means.mean()), dof) - np.sqrt(variance)
@@ -111,7 +105,7 @@ def oracle(means, dof, steps, gaussian=True):
     by_likelihood = np.log(2.0) + log_a - error
     nu = min(np.exp(min(by_spread, by_likelihood)), dof * steps)
     nu, spread = (dof, np.inf) if gaussian and nu <= dof else (nu, 2.0 / variance)
-    return Oracle(nu, spread, by_spread, by_likelihood, shift, abs(distance) > reach, unfloored < 2.0 / N)
+    return Oracle(nu, spread, by_spread, by_likelihood)
 
 
 def tails(ratio, k, spread):
@@ -157,7 +151,7 @@ def test_effective_dof_and_p_values(name, gaussian):
     means, dof, steps = CASES[name]
     test, expected = scale_test(means, dof, steps, gaussian), oracle(means, dof, steps, gaussian)
     if steps == 1 and gaussian:
-        expected = Oracle(dof, np.inf, 0.0, 0.0, 0.0, False, False)
+        expected = Oracle(dof, np.inf)
     assert test.runs == len(means)
     assert test.ratio == pytest.approx(means.mean(), rel=1e-12)
     assert test.effective_dof == pytest.approx(expected.nu, rel=2e-6)
@@ -166,22 +160,6 @@ def test_effective_dof_and_p_values(name, gaussian):
     assert test.above == pytest.approx(above, rel=1e-6, abs=1e-300)
     assert test.below == pytest.approx(below, rel=1e-6, abs=1e-300)
     assert test.p_value == pytest.approx(min(1.0, 2.0 * min(above, below)), rel=1e-6)
-
-
-def test_the_cases_reach_every_branch():
-    """Otherwise a fault in one of them would not be seen above."""
-    all_ = {name: oracle(*case) for name, case in CASES.items()}
-    free = {name: o for name, o in all_.items() if np.isfinite(o.spread)}
-    several = {name: o for name, o in free.items() if o.nu < CASES[name][1] * CASES[name][2]}
-    assert any(o.by_spread < o.by_likelihood - 0.01 for o in several.values())
-    assert any(o.by_likelihood < o.by_spread - 0.01 for o in several.values())
-    first = {name: o for name, o in several.items() if o.by_spread < o.by_likelihood}
-    assert any(o.shift < -0.01 and not o.clipped for o in first.values())
-    assert any(o.shift < -0.01 and o.clipped for o in first.values())
-    assert any(o.shift > 0.01 for o in first.values())
-    assert any(o.floored for o in several.values())
-    assert any(not o.floored for o in several.values())
-    assert len(several) < len(free) < len(all_)  # limited above and below
 
 
 @pytest.mark.parametrize("runs", [1, 2, 19])
@@ -198,17 +176,6 @@ def test_below_twenty_runs_the_worst_case_is_taken(runs):
 def test_a_run_without_any_error_leaves_the_worst_case():
     means = np.append(np.full(40, 1.1) + 0.01 * np.arange(40), 0.0)
     assert scale_test(means, 2, 100).effective_dof == 2.0
-
-
-def test_a_right_filter_has_p_values_near_uniform_at_full_dependence():
-    """1,000 draws at 2.5 %, with 19 runs (exact) and 21 and 60 (estimated, nu at its lower end more often than not)."""
-    rng = np.random.default_rng(2)
-    draws, level = 1000, 0.025
-    for runs, n in ((19, 1), (21, 1), (60, 3)):
-        p = np.array([scale_test(rng.chisquare(n, runs) / n, n, 100).p_value for _ in range(draws)])
-        count = int((p <= level).sum())
-        assert count <= stats.binom.isf(SURE, draws, level)
-        assert count >= (stats.binom.ppf(SURE, draws, level) if runs < 20 else 1)
 
 
 def test_effective_dof_of_known_worlds():
@@ -400,15 +367,6 @@ def test_level_is_one_less_the_power():
     at_stake = equivalence(means, 3, 50, Settings()).p_value
     assert equivalence(means, 3, 50, Settings(power=1 - 1.01 * at_stake)).shown
     assert not equivalence(means, 3, 50, Settings(power=1 - 0.99 * at_stake)).shown
-
-
-@pytest.mark.parametrize("ratio", [1.5, 1 / 1.5])
-@pytest.mark.parametrize("runs", [12, 40])
-def test_a_ratio_at_the_end_is_seldom_called_equivalent(ratio, runs):
-    """Fully dependent, 500 draws at 5 % (Student's t leaves up to .7 % more from 20 runs on)."""
-    rng = np.random.default_rng(24)
-    shown = sum(equivalence(gamma_means(rng, runs, 3.0, ratio), 3, 50, Settings()).shown for _ in range(500))
-    assert shown <= stats.binom.isf(SURE, 500, 0.057)
 
 
 def test_a_mean_of_unlike_runs_at_the_end_is_seldom_called_equivalent():

@@ -181,14 +181,14 @@ class Exceedance:
 
         return float(least(np.zeros(len(sizes), int))[0]), least(some.astype(int))
 
-    def rate_limit(self, confidence: float = CONFIDENCE) -> float:
+    def rate_limit(self) -> float:
         """Rate of steps outside that the runs exclude, with all larger ones: 3 / N where N runs never leave."""
-        return self._end(1.0 - self.shares()[1], 1.0 - confidence)
+        return self._end(1.0 - self.shares()[1], 1.0 - CONFIDENCE)
 
-    def rate_interval(self, tail: float = TAIL) -> Interval:
+    def rate_interval(self) -> Interval:
         """Share of steps outside, and the rates that neither side rejects."""
-        high = self._end(1.0 - self.shares()[1], tail)
-        low = 1.0 - self._end(self.shares()[0], tail)
+        high = self._end(1.0 - self.shares()[1], TAIL)
+        low = 1.0 - self._end(self.shares()[0], TAIL)
         rate = self.rate()
         return Interval(rate, min(low, rate), max(high, rate))
 

@@ -120,9 +120,7 @@ class BoundErrors:
 
     bounds: tuple[Bound, ...]
     ratios: Array  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
-    regions: Array | None = (
-        None  # (runs, steps, bounds), places in REGIONS; NaN without an alert limit, or as the error
-    )
+    regions: Array | None = None  # (runs, steps, bounds), places in REGIONS; NaN as the ratios, or without a limit
 
     OF_RUNS: ClassVar = ("ratios", "regions")
 

@@ -116,10 +116,8 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
         names = ("",) if some.groups is None else some.groups.names
         in_group = index == names.index(factor.group) if factor.group or some.groups is None else index < 0
         ratios[..., b] = np.where(in_group, stated.ratios[..., b] / np.array(own)[:, None], ratios[..., b])
-    some, corrected = (  # regions are of the bounds as they are stated
-        replace(some, errors=replace(some.errors, bounded=BoundErrors(stated.bounds, each)))
-        for each in (stated.ratios, ratios)
-    )
+    some = _over_bounds(some, BoundErrors(stated.bounds, stated.ratios))  # regions are of bounds as they are stated
+    corrected = _over_bounds(some, BoundErrors(stated.bounds, ratios))
     rates = {
         bound.name: Exceedance(np.abs(ratios[..., b]), np.zeros(len(ratios), int), bound.level).rate_interval()
         for b, bound in enumerate(stated.bounds)
@@ -128,6 +126,10 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
     names_of = tuple(labels[i] for i in fitted), tuple(labels[i] for i in judged)
     numbers = tuple(some.run_numbers.tolist())
     return BoundCorrection(record.name, factors, held_out or IN_TURN, *names_of, numbers, before, after, rates)
+
+
+def _over_bounds(record: Record, bounded: BoundErrors) -> Record:
+    return replace(record, errors=replace(record.errors, bounded=bounded))
 
 
 def _factors(record: Record, b: int, in_turn: bool) -> list[BoundFactor]:

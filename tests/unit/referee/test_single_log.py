@@ -321,13 +321,6 @@ def test_the_first_band_by_hand():
     assert found.sizes == pytest.approx(min(1.0, min(p) * bands / SIZES))
 
 
-@pytest.mark.parametrize("count", [20, 31, 200])
-def test_independent_pieces_are_doubted_at_the_stated_rate(count, rng):
-    """400 logs; the rate of 0.5 % is exceeded by chance in 1e-5."""
-    doubted = sum(independence(rng.normal(size=(count, 3))).doubtful for _ in range(400))
-    assert doubted <= stats.binom.isf(SURE, 400, 0.005)
-
-
 @pytest.mark.parametrize("memory, count", [(0.5, 400), (0.8, 150), (0.95, 150)])
 def test_sizes_that_go_on_are_doubted(memory, count, rng):
     """Missed in fewer than 1e-5: signs are independent, sizes AR."""

@@ -58,27 +58,26 @@ class Case:
         )  # fmt: skip
 
 
-def make(scale=1.0, bias=0.0, runs=RUNS, steps=STEPS):
-    """Errors of covariance P (and mean ``bias`` standard deviations along x) that a filter calls P / scale.
+def make(scale=1.0):
+    """Errors of covariance P that a filter calls P / scale.
 
     Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
     """
     rng = np.random.default_rng(5)
-    e = autoregression(rng, runs, steps, 3, 0.9)
+    e = autoregression(rng, RUNS, STEPS, 3, 0.9)
     P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])
-    error = e @ np.linalg.cholesky(P).T + [bias * 0.2, 0.0, 0.0]
-    covariance = np.broadcast_to(P / scale, (runs, steps, 3, 3)).copy()
-    nis_dof = rng.integers(0, 4, (runs, steps)) * 3
+    error = e @ np.linalg.cholesky(P).T
+    covariance = np.broadcast_to(P / scale, (RUNS, STEPS, 3, 3)).copy()
+    nis_dof = rng.integers(0, 4, (RUNS, STEPS)) * 3
     nis = np.where(nis_dof > 0, scale * rng.chisquare(np.maximum(nis_dof, 1)), np.nan)
     return Case(error, covariance, cs.nees(error, covariance), nis, nis_dof)
 
 
-def broken(case, run, step):
-    """The case with nothing from ``step`` of ``run`` on."""
-    arrays = {name: value.copy() for name, value in vars(case).items()}
-    for name in ("error", "covariance", "nees", "nis"):
-        arrays[name][run, step - 1 :] = np.nan
-    arrays["nis_dof"][run, step - 1 :] = 0
+def broken():
+    """A right case with nothing from where ``BROKE`` on."""
+    arrays = {name: value.copy() for name, value in vars(make()).items()}
+    for name, array in arrays.items():
+        array[BROKE.run, BROKE.step - 1 :] = 0 if name == "nis_dof" else np.nan
     return Case(**arrays)
 
 
@@ -127,7 +126,7 @@ def test_bonferroni_band_over_all_steps():
 
 
 def test_a_run_that_fails_midway_counts_only_before():
-    s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
+    s = broken().verdict((BROKE,)).statistics
     assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))
     assert s["left_out_steps"] == []
     # fewer runs, wider band
@@ -154,7 +153,7 @@ def test_without_truth_the_nis_is_judged(scale, status):
 
 
 def test_without_truth_a_failed_run_counts_too():
-    verdict = blind(broken(make(), 3, 12), failures=(BROKE,))
+    verdict = blind(broken(), failures=(BROKE,))
     assert verdict.status == "failed"
     assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
 

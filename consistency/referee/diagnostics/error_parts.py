@@ -353,16 +353,11 @@ def _shown_pairs(sample: Sample, here: slice, false_alarm: float) -> Array:
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    run = -1
-    step = 0
-    distance = float("nan")
-    if tests.outlier is not None:
-        run = tests.outlier.run
-        step = tests.outlier.step + 1
-        distance = tests.outlier.distance
-    if run >= 0:
-        run = int(run_numbers[run])
-    return Tails(run, step, distance, tests.pit.values, tests.pit.half_width)
+    found = tests.outlier
+    if found is None or found.run < 0:
+        return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
+    run = int(run_numbers[found.run])
+    return Tails(run, found.step + 1, found.distance, tests.pit.values, tests.pit.half_width)
 
 
 def accuracy_of(sample: Sample) -> Accuracy:

@@ -267,21 +267,20 @@ def runs_and_steps(record: Record) -> tuple[int, int]:
     ValueError
         They do not agree, or nothing is there.
     """
-    dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
     arrays = {
-        "error": record.errors.error,
-        "covariance": record.errors.covariance,
-        "nees": record.errors.nees,
-        "nis": record.innovations.nis,
-        "nis_dof": record.innovations.nis_dof,
-        "innovations": record.innovations.values,
+        "error": (record.errors.error, "runs, steps, n"),
+        "covariance": (record.errors.covariance, "runs, steps, n, n"),
+        "nees": (record.errors.nees, "runs, steps"),
+        "nis": (record.innovations.nis, "runs, steps"),
+        "nis_dof": (record.innovations.nis_dof, "runs, steps"),
+        "innovations": (record.innovations.values, "runs, steps, n"),
     }
-    shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
+    shapes = {name: np.shape(array) for name, (array, _) in arrays.items() if array is not None}
     if not set(shapes) - {"covariance", "nis_dof"}:
         raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     for name, shape in shapes.items():
-        if len(shape) != dimensions[name]:
-            expected = ", ".join(["runs", "steps", "n", "n"][: dimensions[name]])
+        expected = arrays[name][1]
+        if len(shape) != len(expected.split()):
             raise ValueError(f"{name} must be ({expected}), got shape {shape}")
     if len({shape[:2] for shape in shapes.values()}) > 1:
         raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")

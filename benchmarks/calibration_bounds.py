@@ -17,7 +17,7 @@ from scipy.special import ndtri
 
 from consistency.diagnostics import Settings, judge
 from consistency.referee.diagnostics.exceedance import betting, bound_runs, fewest_runs, gaffke
-from consistency.referee.diagnostics.record import Bound, Errors, Record
+from consistency.referee.diagnostics.record import Bound, BoundErrors, Errors, Record
 from consistency.referee.types import Array
 
 STEPS, GATES, QUICK_GATES, CHUNK = 50, 2000, 100, 250
@@ -178,4 +178,4 @@ def _is_fault(rng: np.random.Generator, phi: float) -> bool:
     """Whether a whole verdict finds right bounds of 95 % on two components at fault."""
     ratios = np.moveaxis(errors_of(rng, (2, 100, STEPS), phi), 0, -1) / -ndtri(0.025)
     bounds = (Bound("bound_x", ("x",), 0.95), Bound("bound_y", ("y",), 0.95))
-    return bool(judge(Record("gate", Errors(bounds=bounds, bound_ratios=ratios)), Settings()).faults)
+    return bool(judge(Record("gate", Errors(bounded=BoundErrors(bounds, ratios))), Settings()).faults)

@@ -236,9 +236,9 @@ def _clear(quick: bool, seed: int) -> Iterator[dict[str, Any]]:
                 sample = Sample(make_record(world, nees=nees, dof=n, groups=groups), nees, n)
                 number = int(rng.integers(len(groups.names)))
                 one = sample.in_group(number)
-                if len(one.means):
+                if len(one.values):
                     count += 1
-                    found += equivalence(one.means, n, one.longest, settings, weights=one.counts).shown
+                    found += equivalence(one.values, n, one.steps, settings, weights=one.counts).shown
             yield row(world, CLEAR, ratio, runs, round(1.0 - POWER, 3), "<=", count, found)
 
 

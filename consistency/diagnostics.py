@@ -40,6 +40,7 @@ from consistency.referee.diagnostics.number_of_runs import (
 from consistency.referee.diagnostics.planning import Design, PilotPlan, pilot_plan, sequential_design
 from consistency.referee.diagnostics.record import (
     Bound,
+    BoundErrors,
     Ensemble,
     Errors,
     Evidence,
@@ -93,6 +94,7 @@ __all__ = [
     "Answer",
     "Band",
     "Bound",
+    "BoundErrors",
     "Comparison",
     "Design",
     "Difference",

@@ -390,7 +390,7 @@ def _settle(
         else:
             share, detect = demand.false_alarm / rate_shares(record), planned_detect(record, demand.detect)
             each = replace(demand, false_alarm=share, detect=detect)
-            level = record.errors.bounds[0].level if record.errors.bounds else None
+            level = record.errors.bounded.bounds[0].level if record.errors.bounded else None
             text = undecided_text(gate, record.name, result.reasons[0], least, dof, each, level)
             text += marker_text(dof, runs) if level is None else ""
         raise InsufficientTrials(text, least, runs, result.verdict)

@@ -22,8 +22,8 @@ NAMES = {  # module -> its public names; also those of CONTRACT.md, of docs/api,
         verdict_table""",
     "consistency.challenging": "Challenge Plan challenge",
     "consistency.diagnostics": """
-        Alarm Answer Band Bound Comparison Design Difference EProcess EarlyEnds Ensemble Equivalence Errors
-        Evidence GateShare Hotelling Independence InnovationRecord Interval JointNees Largest Map MapRecord
+        Alarm Answer Band Bound BoundErrors Comparison Design Difference EProcess EarlyEnds Ensemble Equivalence
+        Errors Evidence GateShare Hotelling Independence InnovationRecord Interval JointNees Largest Map MapRecord
         MapScore MeanTest Monitor NisTest Normality Origin Outlier PilotPlan Pit RatioTable Record RejectionScore
         Rejections RunSummary Runs Settings Skip Truth TruthFit Verdict Whiteness anees anees_interval answers
         chi2_mean_interval clustered_share compare coverage coverage_interval detectable_ratio e_process early_ends

@@ -87,20 +87,19 @@ class StepMoments(NamedTuple):
 
 def step_moments(whitened: Array) -> StepMoments:
     """Moments of whitened errors (runs, steps, n)."""
-    runs, steps = whitened.shape[:2]
-    N, mean, S = zip(*(_moments(whitened[:, here]) for here in block_slices(steps, runs)), strict=True)
-    return StepMoments(np.concatenate(N), np.concatenate(mean), np.concatenate(S))
-
-
-def _moments(whitened: Array) -> tuple[Array, Array, Array]:
-    present = all_finite(whitened)
-    N = present.sum(axis=0)
-    w = np.where(present[..., None], whitened, 0.0)
-    mean = w.sum(axis=0) / np.maximum(N, 1)[:, None]
-    w = np.where(present[..., None], w - mean, 0.0)
-    by_step = np.ascontiguousarray(np.moveaxis(w, 1, 0))  # (steps, runs, n)
-    S = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(N - 1, 1)[:, None, None]
-    return N, mean, S
+    runs, steps, n = whitened.shape
+    moments = StepMoments(np.zeros(steps, int), np.zeros((steps, n)), np.zeros((steps, n, n)))
+    for here in block_slices(steps, runs):
+        present = all_finite(whitened[:, here])
+        N = present.sum(axis=0)
+        w = np.where(present[..., None], whitened[:, here], 0.0)
+        mean = w.sum(axis=0) / np.maximum(N, 1)[:, None]
+        w = np.where(present[..., None], w - mean, 0.0)
+        by_step = np.ascontiguousarray(np.moveaxis(w, 1, 0))  # (steps, runs, n)
+        moments.runs[here] = N
+        moments.mean[here] = mean
+        moments.covariance[here] = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(N - 1, 1)[:, None, None]
+    return moments
 
 
 def identity_statistic(whitened: Array) -> tuple[float, float]:

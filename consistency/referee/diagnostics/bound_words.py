@@ -6,7 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from consistency.referee.diagnostics.number_words import MOST, names_in_a_row, percent, plural, ratio_text, short
+from consistency.referee.diagnostics.number_words import (
+    MOST,
+    between_text,
+    names_in_a_row,
+    percent,
+    plural,
+    ratio_text,
+    short,
+)
 from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.diagnostics.verdict_parts import HAZARD, REGIONS, SIDES, Alerts, BoundScore, Interval
 
@@ -50,14 +58,13 @@ def bounds_sentence(v: Findings) -> str:
     if not judged:
         return none
     if not open_:
-        return f"{none} in {runs}, and {_subject(judged)} is shown to be {_between(judged[0])}: {_factors(judged)}"
+        where = between_text(judged[0].equivalence)
+        return f"{none} in {runs}, and {_subject(judged)} is shown to be {where}: {_factors(judged)}"
     if max(score.fewest for score in open_) > v.runs:
         return f"{none}, but {_too_few(v, open_)}{_advice(v, open_)}"
     do = "does" if v.runs == 1 else "do"
-    return (
-        f"{none}, but {runs} {do} not show {_subject(open_)} to be {_between(open_[0])}: "
-        f"{_factors(open_)}{_advice(v, open_)}"
-    )
+    where = between_text(open_[0].equivalence)
+    return f"{none}, but {runs} {do} not show {_subject(open_)} to be {where}: {_factors(open_)}{_advice(v, open_)}"
 
 
 def deciding(scores: Sequence[BoundScore]) -> BoundScore:
@@ -114,13 +121,6 @@ def _subject(scores: Sequence[BoundScore]) -> str:
 
 def _factors(scores: Sequence[BoundScore]) -> str:
     return ", ".join(factor_text(score.factor) for score in scores[:MOST])
-
-
-def _between(score: BoundScore) -> str:
-    shown = score.equivalence
-    if shown.one_sided:
-        return f"below {short(shown.factor)}"
-    return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
 
 
 def _too_few(v: Findings, scores: Sequence[BoundScore]) -> str:

@@ -60,7 +60,7 @@ def findings_of_bounds(record: Record, settings: Settings) -> Findings:
     measured. *Consistent* is shown by two one-sided tests that the factor by which the bound has to grow lies within
     the root of ``settings.detect``.
     """
-    assert record.errors.bound_ratios is not None
+    assert record.errors.bounded is not None
     asked = list(_questions(record))
     test = betting if settings.false_alarm <= GATE_FALSE_ALARM else gaffke
     small = {q.name: q.sizes.p_small(test=test) for q in asked if q.judged}
@@ -79,7 +79,7 @@ def findings_of_bounds(record: Record, settings: Settings) -> Findings:
     status = _status(scores, record)
     if status == "undecided":
         scores = tuple(_with_runs(score, settings) for score in scores)
-    steps = record.errors.bound_ratios.shape[1]
+    steps = record.errors.bounded.ratios.shape[1]
     return Findings(
         filter=record.name,
         status=status,
@@ -98,17 +98,17 @@ def findings_of_bounds(record: Record, settings: Settings) -> Findings:
 
 def _questions(record: Record) -> Iterator[Question]:
     """Each bound in all steps, then in each group; groups are not judged where ends may depend on the errors."""
-    assert record.errors.bound_ratios is not None
-    groups = record.groups
-    for i, bound in enumerate(record.errors.bounds):
-        ratios = record.errors.bound_ratios[..., i]
+    assert record.errors.bounded is not None
+    of, groups = record.errors.bounded, record.groups
+    for i, bound in enumerate(of.bounds):
+        ratios = of.ratios[..., i]
         missing = missing_steps(ratios)
         if bound.ends_independent:
             missing = np.zeros_like(missing)
         sizes = Exceedance(np.abs(ratios), missing, bound.level)
         regions = None
-        if bound.alert_limit is not None and record.errors.regions is not None:
-            regions = record.errors.regions[..., i]
+        if bound.alert_limit is not None and of.regions is not None:
+            regions = of.regions[..., i]
         yield Question(bound.name, bound, ratios, sizes, regions, "", sizes.runs > 0)
         for number, name in enumerate(() if groups is None else groups.names):
             assert groups is not None

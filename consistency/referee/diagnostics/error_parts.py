@@ -44,7 +44,6 @@ from consistency.referee.diagnostics.scale import (
     equivalence,
     pointwise_band,
     ratio_interval,
-    scale_test,
     simultaneous_band,
 )
 from consistency.referee.diagnostics.tails import Outlier, beyond_stated, outliers
@@ -99,7 +98,10 @@ def error_parts(
 ) -> ErrorParts:
     """All parts of the errors of a sample; those of NEES alone have no components."""
     faults = set(faults_of(given))
-    band = _band_of_fault(sample, tests, faults, settings)
+    band = tests.band
+    if STEP in faults and not band.outside.any():  # found by what Holm's correction left over: a band that shows it
+        rate = np.nextafter(band.p_value, 1.0) * (1 + 1e-6)
+        band = simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
     location = location_of(sample, band, faults, ordered=record.map.landmarks is None, detect=settings.factor)
     scaled = at_share(given, settings)
     scale = scale_of(sample, tests, scaled, location, shown, faults)
@@ -119,20 +121,11 @@ def error_parts(
     )
 
 
-def _band_of_fault(sample: Sample, tests: Tests, faults: set[str], settings: Settings) -> Band:
-    """The band of the steps; where they were found by what Holm's correction left over, one that shows it."""
-    if STEP not in faults or tests.band.outside.any():
-        return tests.band
-    rate = np.nextafter(tests.band.p_value, 1.0) * (1 + 1e-6)
-    return simultaneous_band(sample.nees, sample.dof, rate, settings.method, settings.allow)
-
-
 def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Settings) -> tuple[Answer, ...]:
     """Answers with faults of the scale marked as tolerated whose ratio is shown to lie within the tolerance."""
     if settings.tolerance is None:
         return tuple(given)
     R = settings.tolerated
-    dof = sample.dof
     if not _is_tolerated(sample.run_means(), settings):
         return tuple(given)
     tolerated = {MAIN}
@@ -142,7 +135,7 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
     if tests.largest is not None and tests.largest.ratio.high <= R:
         tolerated.add(DIRECTION)
     by_group = [sample.in_group(number) for number in range(len(tests.groups))]
-    if all(equivalence(one.means, dof, one.longest, settings, R, weights=one.counts).shown for one in by_group):
+    if all(equivalence(one.values, one.dof, one.steps, settings, R, weights=one.counts).shown for one in by_group):
         tolerated.add(GROUP)
     curve = anees(sample.nees)
     if not ((curve > tests.band.high * R) | (curve < tests.band.low / R)).any():
@@ -237,7 +230,7 @@ def by_group_of(
     if groups is None:
         return None
     found = [sample.in_group(number) for number in range(len(groups.names))]
-    there = sum(len(one.means) > 0 for one in found)
+    there = sum(len(one.values) > 0 for one in found)
     is_asked = any(answer.question == GROUP for answer in given)
     is_found = GROUP in faults_of(given)
     both_sides = replace(settings, allow=None) if record.fit.reduced else settings
@@ -248,18 +241,18 @@ def by_group_of(
     by_group = []
     spans = None if groups.edges is None else spans_of(groups.edges)
     for number, (name, one) in enumerate(zip(groups.names, found, strict=True)):
-        if not len(one.means):
+        if not len(one.values):
             continue
-        shown = equivalence(one.means, sample.dof, one.longest, both_sides, factor, weights=one.counts)
+        shown = equivalence(one.values, one.dof, one.steps, both_sides, factor, weights=one.counts)
         p_value = float("nan")
         status = ""
         if is_asked:
             p_value = min(1.0, sided_p_value(tests.groups[number], settings) * there)
             is_wrong = is_found and p_value <= settings.false_alarm
             status = _status_of_group(tests.groups[number].ratio, is_wrong, shown)
-        ratio = ratio_interval(one.means, sample.dof, confidence, one.counts)
+        ratio = ratio_interval(one.values, one.dof, confidence, one.counts)
         span = None if spans is None else spans[number]
-        by_group.append(Group(name, len(one.means), int(one.counts.sum()), ratio, p_value, shown, status, span))
+        by_group.append(Group(name, len(one.values), int(one.counts.sum()), ratio, p_value, shown, status, span))
     without = int((sample.counted & (groups.index < 0)).sum())
     return ByGroup(groups.column, tuple(by_group), groups.outcome, without)
 
@@ -360,16 +353,11 @@ def _shown_pairs(sample: Sample, here: slice, false_alarm: float) -> Array:
 
 def tails_of(tests: Tests, run_numbers: Indices) -> Tails:
     """The error that stands out most, and the whole distribution; ``run_numbers`` (runs,) names the runs."""
-    run = -1
-    step = 0
-    distance = float("nan")
-    if tests.outlier is not None:
-        run = tests.outlier.run
-        step = tests.outlier.step + 1
-        distance = tests.outlier.distance
-    if run >= 0:
-        run = int(run_numbers[run])
-    return Tails(run, step, distance, tests.pit.values, tests.pit.half_width)
+    found = tests.outlier
+    if found is None or found.run < 0:
+        return Tails(-1, 0, float("nan"), tests.pit.values, tests.pit.half_width)
+    run = int(run_numbers[found.run])
+    return Tails(run, found.step + 1, found.distance, tests.pit.values, tests.pit.half_width)
 
 
 def accuracy_of(sample: Sample) -> Accuracy:
@@ -518,11 +506,7 @@ def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
     """Test of the scale in each group of runs and steps by itself; none where groups do not convict."""
     if sample.groups is None or sample.groups.outcome:
         return ()
-    tests = []
-    for number in range(len(sample.groups.names)):
-        in_group = sample.in_group(number)
-        tests.append(scale_test(in_group.means, sample.dof, in_group.longest, weights=in_group.counts))
-    return tuple(tests)
+    return tuple(sample.in_group(number).by_steps() for number in range(len(sample.groups.names)))
 
 
 def _distribution(sample: Sample, settings: Settings, distribution: Pit) -> float:

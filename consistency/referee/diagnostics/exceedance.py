@@ -7,6 +7,7 @@ the expected share is at most ``a``; whether it is at least ``a`` is the same qu
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -135,9 +136,9 @@ class Exceedance:
         upper end is infinite where the runs are too few to show any bound too large.
         """
         at = np.unique(np.r_[0.0, self.ratios[~np.isnan(self.ratios)]])
-        small = _first(lambda i: self.p_small(at[i]) > tail, len(at))
-        large = _first(lambda i: self.p_large(at[i]) <= tail, len(at))
-        right = _first(lambda i: self.rate(at[i]) <= self.a, len(at))
+        small = bisect_left(at, True, key=lambda factor: self.p_small(factor) > tail)
+        large = bisect_left(at, True, key=lambda factor: self.p_large(factor) <= tail)
+        right = bisect_left(at, True, key=lambda factor: self.rate(factor) <= self.a)
         ends = np.append(at, np.inf)
         low, high = float(ends[small]), float(ends[large])
         return Interval(float(np.clip(ends[right], low, high)), low, high)
@@ -180,14 +181,14 @@ class Exceedance:
 
         return float(least(np.zeros(len(sizes), int))[0]), least(some.astype(int))
 
-    def rate_limit(self, confidence: float = CONFIDENCE) -> float:
+    def rate_limit(self) -> float:
         """Rate of steps outside that the runs exclude, with all larger ones: 3 / N where N runs never leave."""
-        return self._end(1.0 - self.shares()[1], 1.0 - confidence)
+        return self._end(1.0 - self.shares()[1], 1.0 - CONFIDENCE)
 
-    def rate_interval(self, tail: float = TAIL) -> Interval:
+    def rate_interval(self) -> Interval:
         """Share of steps outside, and the rates that neither side rejects."""
-        high = self._end(1.0 - self.shares()[1], tail)
-        low = 1.0 - self._end(self.shares()[0], tail)
+        high = self._end(1.0 - self.shares()[1], TAIL)
+        low = 1.0 - self._end(self.shares()[0], TAIL)
         rate = self.rate()
         return Interval(rate, min(low, rate), max(high, rate))
 
@@ -201,18 +202,6 @@ class Exceedance:
             else:
                 low = rate
         return high
-
-
-def _first(holds: Callable[[int], bool], count: int) -> int:
-    """The first of ``count`` numbers for which something holds that then holds for all after it; ``count`` if none."""
-    low, high = 0, count
-    while low < high:
-        middle = (low + high) // 2
-        if holds(middle):
-            high = middle
-        else:
-            low = middle + 1
-    return low
 
 
 def missing_steps(ratios: Array) -> Indices:

@@ -15,6 +15,7 @@ from consistency.referee.diagnostics.number_words import (
     MOST,
     SIDE,
     SMALLEST_P,
+    first_few,
     is_or_are,
     is_uncertain,
     names_in_a_row,
@@ -219,19 +220,14 @@ def _axes_text(v: Findings) -> str:
         off |= _wrong(v, -1)
     largest = v.axes.largest
     if largest is not None and DIRECTION in v.faults and not any(i.value >= largest.value for i in off.values()):
-        return f"covariance {off_by(largest)} in the direction {_direction_text(v)}"
+        u = v.axes.direction  # of errors in stated standard deviations
+        assert u is not None
+        u = u * np.sign(u[np.argmax(np.abs(u))])
+        named = [f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED_PART]
+        return f"covariance {off_by(largest)} in the direction {' '.join(named)}"
     if not off:
         return "covariance wrong in an axis"
     return f"covariance {_sizes_in_axes(off)}{since_text(v)}"
-
-
-def _direction_text(v: Findings) -> str:
-    """The worst direction, of errors in stated standard deviations."""
-    assert v.axes is not None
-    assert v.axes.direction is not None
-    u = v.axes.direction
-    u = u * np.sign(u[np.argmax(np.abs(u))])
-    return " ".join(f"{part:+.2f} {name}" for part, name in zip(u, v.axes.names, strict=True) if abs(part) > NAMED_PART)
 
 
 def _sizes_in_axes(off: dict[str, Interval]) -> str:
@@ -325,33 +321,28 @@ def tails_text(v: Findings) -> str:
 
 
 def innovation_faults(v: Findings, i: Innovations) -> list[str]:
-    """The faults that were found in the innovations."""
+    """The faults that were found in the innovations: of outliers which they are, and the size of the rest."""
     texts = []
-    if "innovation scale" in v.faults:
-        texts.append(_innovation_scale(v, i))
-    if "innovation whiteness" in v.faults:
-        texts.append("innovations correlated over steps")
-    return texts
-
-
-def _innovation_scale(v: Findings, i: Innovations) -> str:
-    """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
     far = i.outliers
-    if far is None:
+    if "innovation scale" in v.faults and far is None:
         size = "smaller"
         if i.ratio > 1:
             size = "larger"
-        return f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})"
-    are = "are outliers, the largest"
-    if far.count == 1:
-        are = "is an outlier,"
-    where = v.place(far.step)
-    if v.runs > 1:
-        where = f"{v.run_name(far.run)}, {where}"
-    return (
-        f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} expected); "
-        f"NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
-    )
+        texts.append(f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})")
+    elif "innovation scale" in v.faults and far is not None:
+        are = "are outliers, the largest"
+        if far.count == 1:
+            are = "is an outlier,"
+        where = v.place(far.step)
+        if v.runs > 1:
+            where = f"{v.run_name(far.run)}, {where}"
+        texts.append(
+            f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} "
+            f"expected); NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
+        )
+    if "innovation whiteness" in v.faults:
+        texts.append("innovations correlated over steps")
+    return texts
 
 
 def joint_text(v: Findings, joint: JointScore) -> str:
@@ -364,19 +355,15 @@ def joint_text(v: Findings, joint: JointScore) -> str:
     elif map_is_wrong and not pose_is_wrong:
         part = ", mainly the map given the pose"
     if joint.chief and not pose_is_wrong:
-        part += f" ({_chief_landmarks(joint.chief)})"
+        text = f"most in landmarks {', '.join(map(str, joint.chief[:MOST]))}"
+        if len(joint.chief) == 1:
+            text = f"most in landmark {joint.chief[0]}"
+        elif len(joint.chief) > MOST:
+            text += f" and {len(joint.chief) - MOST} more"
+        part += f" ({text})"
     if SIDES.get(v.status, 0) * (joint.both.value - 1.0) < 0.0:
         return f"pose and map together: the {v.unit}s differ more than Gaussian errors would{part}"
     return f"pose and map together: covariance {off_by(joint.both)}{part}"
-
-
-def _chief_landmarks(chief: tuple[int, ...]) -> str:
-    if len(chief) == 1:
-        return f"most in landmark {chief[0]}"
-    text = f"most in landmarks {', '.join(str(label) for label in chief[:MOST])}"
-    if len(chief) > MOST:
-        text += f" and {len(chief) - MOST} more"
-    return text
 
 
 def fault_sentence(v: Findings, s: Scale) -> str:
@@ -569,10 +556,8 @@ def right_groups(v: Findings) -> str:
     """What is shown of the groups of the whole, or of each part, where none is at fault."""
     if v.by_group is not None:
         return f"; {_without_fault(v.by_group)}"
-    texts = [f"; {name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"; and {len(texts) - MOST} more"]
-    return "".join(texts)
+    texts = [f"{name}: {_without_fault(part.by_group)}" for name, part in v.parts.items() if part.by_group]
+    return "; ".join(["", *first_few(texts)])
 
 
 def _without_fault(by: ByGroup) -> str:

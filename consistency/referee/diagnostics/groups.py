@@ -117,10 +117,7 @@ def groups_of(column: Column, bins: int | Sequence[float] = BINS, counted: Array
     some = column.values[there]
     if column.words:
         return _by_words(column, some)
-    edges = _checked_edges(bins)
-    if edges is None:
-        assert isinstance(bins, int)
-        edges = _quantiles(some, bins)
+    edges = _edges(some, bins)
     if not edges or not len(some):
         raise ValueError(f"the column {_single(some)}; groups need different values")
     index = np.searchsorted(np.asarray(edges), column.values, side="left")
@@ -149,12 +146,12 @@ def _by_words(column: Column, some: Array) -> Groups:
     )
 
 
-def _checked_edges(bins: int | Sequence[float]) -> tuple[float, ...] | None:
-    """The edges that are given; None where bins are a number of quantile bins."""
+def _edges(values: Array, bins: int | Sequence[float]) -> tuple[float, ...]:
+    """The edges that are given, or those of a number of quantile bins."""
     if isinstance(bins, (int, np.integer)):
         if not 2 <= bins <= MOST:
             raise ValueError(f"bins must be 2 to {MOST}, or edges between groups; got {bins}")
-        return None
+        return _quantiles(values, bins)
     edges = tuple(float(edge) for edge in bins)
     if not edges or not np.isfinite(edges).all() or (np.diff(edges) <= 0).any() or len(edges) >= MOST:
         raise ValueError(f"bins: edges between groups must be finite and increase, got {', '.join(map(str, bins))}")

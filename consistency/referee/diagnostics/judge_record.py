@@ -12,7 +12,7 @@ from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.scale import ratio_interval, run_means
-from consistency.referee.diagnostics.sentences import details, other_ways, reasons, sentences_of_conventions
+from consistency.referee.diagnostics.sentences import details, other_ways, reasons, same_truth, sentences_of_conventions
 from consistency.referee.diagnostics.status import deciding_axis
 from consistency.referee.diagnostics.verdict import ConventionResult, Findings, MapScore, Verdict
 from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES, RejectionScore, Settings
@@ -65,7 +65,7 @@ def judge(
         return follow(design, record.first_runs, len(record.run_numbers), kept)[0]
     if record.guesses:
         return _judge_conventions(record, settings, kept)
-    if record.errors.bounds:
+    if record.errors.bounded:
         from consistency.referee.diagnostics.bounds import findings_of_bounds
 
         return _whole(record, findings_of_bounds(record, settings), kept)
@@ -121,10 +121,14 @@ def _whole(
     left_out = set(found.left_out_steps)
     if judged.fit.align:
         left_out.update(judged.left_out_steps)
-    causes = (*judged.origin.causes, *_causes_of_innovations(judged, found)) or tuple(_causes_of_level(found))
+    causes = (*judged.origin.causes, *_causes_of_innovations(judged, found))
+    if not causes and found.status == "conservative":
+        from consistency.referee.diagnostics.fault_words import level_causes
+
+        causes = tuple(level_causes(found))
     return Verdict(
         **_in_words(found) | {"left_out_steps": tuple(sorted(left_out))},
-        reasons=(sentence, *figures, *causes, *_same_truth(judged, found), *other_ways(found.status, judged)),
+        reasons=(sentence, *figures, *causes, *same_truth(judged, found), *other_ways(found.status, judged)),
         convention=convention,
         align=align,
         notes=tuple(judged.origin.notes),
@@ -134,24 +138,6 @@ def _whole(
         rejection=rejection,
         record=kept,
     )
-
-
-def _causes_of_level(found: Findings) -> list[str]:
-    """Usual levels that would explain a covariance that is too large; their module is loaded for it."""
-    if found.status != "conservative" or found.bounds:
-        return []
-    from consistency.referee.diagnostics.fault_words import level_causes
-
-    return level_causes(found)
-
-
-def _same_truth(record: Record, found: Findings) -> list[str]:
-    """That all runs have the same truth; its module is loaded where errors are smaller than stated in some step."""
-    if found.location is None or not found.location.steps_below:
-        return []
-    from consistency.referee.diagnostics.sentences import same_truth
-
-    return same_truth(record, found)
 
 
 def _causes_of_innovations(record: Record, found: Findings) -> list[str]:
@@ -268,12 +254,9 @@ def follow(
     kept : record of all runs, kept with the verdict to be drawn
     """
     for runs, spent, is_last in _inspections(design, limit):
-        evidence = evidence_of(runs)
-        if not is_last and not speaks(design, evidence, spent):
-            continue
-        found = _inspected(design, evidence, spent)
-        if is_last or found.status != "undecided":
-            return _of_look(design, evidence, runs, found, kept), runs
+        verdict = _decision(design, evidence_of(runs), runs, spent, is_last, kept)
+        if verdict is not None:
+            return verdict, runs
     raise AssertionError("unreachable: a design without a last look is endless")
 
 
@@ -287,17 +270,14 @@ def looks(
     read : record of the first runs of a filter, by their number and its name
     decided : where verdicts go, by filter
     """
-    for runs, spent in design.inspections():
+    for runs, spent, is_last in _inspections(design, None):
         yield runs
-        is_last = runs == design.max_runs
         for name in filters:
             if name in decided:
                 continue
             evidence = read(runs, name).first_runs(runs)
-            if not is_last and not speaks(design, evidence, spent):
-                continue
-            verdict = look(design, evidence, spent)
-            if is_last or verdict.status != "undecided":
+            verdict = _decision(design, evidence, _end_of_runs(evidence), spent, is_last)
+            if verdict is not None:
                 decided[name] = verdict
         if len(decided) == len(filters):
             return
@@ -314,6 +294,18 @@ def _inspections(design: Design, limit: int | None) -> Iterator[tuple[int, float
         within = [(limit, next(design.inspections())[1])]
     for runs, spent in within:
         yield runs, spent, (runs, spent) == within[-1]
+
+
+def _decision(
+    design: Design, evidence: Record, runs: int, spent: float | None, is_last: bool, kept: Record | None = None
+) -> Verdict | None:
+    """The verdict of an inspection of the first ``runs``; None where the runs continue."""
+    if not is_last and not speaks(design, evidence, spent):
+        return None
+    found = _inspected(design, evidence, spent)
+    if not is_last and found.status == "undecided":
+        return None
+    return _of_look(design, evidence, runs, found, kept)
 
 
 def _inspected(design: Design, evidence: Record, spent: float | None) -> Findings:

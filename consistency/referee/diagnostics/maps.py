@@ -47,14 +47,14 @@ def last_nees(record: Record) -> Array | None:
     """The last NEES that each run has, (runs,), NaN where it has none; None without NEES."""
     if record.errors.nees is None:
         return None
-    return by_runs(_last_of_runs, record.errors.nees)
 
+    def of_block(nees: Array) -> Array:
+        if not nees.size:
+            return np.full(len(nees), np.nan)
+        step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
+        return np.asarray(nees[np.arange(len(nees)), step])
 
-def _last_of_runs(nees: Array) -> Array:
-    if not nees.size:
-        return np.full(len(nees), np.nan)
-    step = nees.shape[1] - 1 - np.argmax(np.isfinite(nees[:, ::-1]), axis=1)
-    return np.asarray(nees[np.arange(len(nees)), step])
+    return by_runs(of_block, record.errors.nees)
 
 
 def joint_nees(error: Array, covariance: Array, dof: int = POINT) -> Array:

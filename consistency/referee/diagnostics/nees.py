@@ -342,7 +342,14 @@ def coverage_interval(
     """
     error = np.asarray(error, float)
     P = np.asarray(covariance, float)
-    there = by_runs(_usable, error, P)
+
+    def usable(error: Array, P: Array) -> Array:
+        out = np.ones(error.shape[:-1], bool)
+        for i in range(error.shape[-1]):
+            out &= np.isfinite(error[..., i]) & np.isfinite(P[..., i, i]) & (P[..., i, i] >= 0)
+        return out
+
+    there = by_runs(usable, error, P)
     if counted is not None:
         there &= counted
     steps = spread_steps(there)
@@ -353,13 +360,6 @@ def coverage_interval(
     variance = np.diagonal(P[rows, steps[rows]], axis1=-2, axis2=-1)
     inside = (np.abs(error[rows, steps[rows]]) <= bound * _sigma(variance)).sum(axis=0)
     return inside / len(rows), np.stack(binomial_interval(inside, len(rows), confidence), axis=-1)
-
-
-def _usable(error: Array, P: Array) -> Array:
-    out = np.ones(error.shape[:-1], bool)
-    for i in range(error.shape[-1]):
-        out &= np.isfinite(error[..., i]) & np.isfinite(P[..., i, i]) & (P[..., i, i] >= 0)
-    return out
 
 
 def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
@@ -380,35 +380,30 @@ def noncredibility(error: Array, nees: Array) -> tuple[Array, Array]:
     (steps,) and (steps,) in dB; NaN where fewer than 2 n runs have a value
     """
     runs, steps = nees.shape
-    if runs < 2 * error.shape[-1]:
-        return np.full(steps, np.nan), np.full(steps, np.nan)
-    index, inclination = zip(*(_of_steps(error[:, s], nees[:, s]) for s in block_slices(steps, runs)), strict=True)
-    return np.concatenate(index), np.concatenate(inclination)
-
-
-def _of_steps(error: Array, nees: Array) -> tuple[Array, Array]:
     n = error.shape[-1]
-    present = np.isfinite(nees) & all_finite(error) & (nees > 0)
-    index = np.full(nees.shape[1], np.nan)
-    inclination = np.full(nees.shape[1], np.nan)
-    runs_in_step = present.sum(axis=0)
-    e = np.where(present[..., None], error, 0.0)
-    by_step = np.ascontiguousarray(np.moveaxis(e, 1, 0))
-    mse = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(runs_in_step, 1)[:, None, None]
-    scale = np.sqrt(np.diagonal(mse, axis1=-2, axis2=-1))
-    scored = (runs_in_step >= 2 * n) & (scale > 0).all(axis=-1)
-    unit = np.where(scored[:, None], scale, 1.0)
-    correlation = mse / (unit[:, :, None] * unit[:, None, :])
-    scored &= np.linalg.cond(np.where(scored[:, None, None], correlation, np.eye(n))) < 1e12
-    if not scored.any():
+    index = np.full(steps, np.nan)
+    inclination = np.full(steps, np.nan)
+    if runs < 2 * n:
         return index, inclination
-    actual = squared_length(whiten(e[:, scored] / unit[scored], correlation[scored]))
-    present_runs = present[:, scored]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        stated_over_actual = np.where(present_runs, nees[:, scored], 1.0) / np.where(present_runs, actual, 1.0)
-        ratio = np.where(present_runs, 10.0 * np.log10(stated_over_actual), 0.0)
-    index[scored] = np.abs(ratio).sum(axis=0) / runs_in_step[scored]
-    inclination[scored] = ratio.sum(axis=0) / runs_in_step[scored]
+    for here in block_slices(steps, runs):
+        present = np.isfinite(nees[:, here]) & all_finite(error[:, here]) & (nees[:, here] > 0)
+        runs_in_step = present.sum(axis=0)
+        e = np.where(present[..., None], error[:, here], 0.0)
+        by_step = np.ascontiguousarray(np.moveaxis(e, 1, 0))
+        mse = np.swapaxes(by_step, -1, -2) @ by_step / np.maximum(runs_in_step, 1)[:, None, None]
+        scale = np.sqrt(np.diagonal(mse, axis1=-2, axis2=-1))
+        scored = (runs_in_step >= 2 * n) & (scale > 0).all(axis=-1)
+        unit = np.where(scored[:, None], scale, 1.0)
+        correlation = mse / (unit[:, :, None] * unit[:, None, :])
+        scored &= np.linalg.cond(np.where(scored[:, None, None], correlation, np.eye(n))) < 1e12
+        if not scored.any():
+            continue
+        actual = squared_length(whiten(e[:, scored] / unit[scored], correlation[scored]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            over_actual = np.where(present[:, scored], nees[:, here][:, scored] / actual, 1.0)
+            ratio = 10.0 * np.log10(over_actual)
+        index[here][scored] = np.abs(ratio).sum(axis=0) / runs_in_step[scored]
+        inclination[here][scored] = ratio.sum(axis=0) / runs_in_step[scored]
     return index, inclination
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from consistency.referee.diagnostics.verdict import Findings
-from consistency.referee.diagnostics.verdict_parts import TINY, Interval
+from consistency.referee.diagnostics.verdict_parts import TINY, Equivalence, Interval
 
 UNCERTAIN = 100.0  # upper over lower end of an interval that says nothing
 SIDE = len("too small")  # or "too large", with which :func:`off_by` begins
@@ -72,6 +72,13 @@ def since_text(v: Findings) -> str:
     return f" in {v.place(where.since, where.until.step)}"
 
 
+def between_text(shown: Equivalence) -> str:
+    """Where a ratio is shown to be, or should be: "between 0.67 and 1.50", or "below 1.50"."""
+    if shown.one_sided:
+        return f"below {short(shown.factor)}"
+    return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
+
+
 def p_text(p: float) -> str:
     """A p value without superfluous digits."""
     if p >= SMALLEST_P:
@@ -98,6 +105,13 @@ def names_in_a_row(names: Sequence[str]) -> str:
     if len(names) < 2:
         return "".join(names)
     return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def first_few(texts: Sequence[str]) -> list[str]:
+    """The first of the texts, and then how many more there are."""
+    if len(texts) <= MOST:
+        return list(texts)
+    return [*texts[:MOST], f"and {len(texts) - MOST} more"]
 
 
 def with_subject(name: str, sentence: str) -> str:

@@ -158,7 +158,7 @@ def pilot_plan(
     return PilotPlan(len(means), test.effective_dof, float(np.sqrt(2.0 / test.spread)), runs)
 
 
-def within(nees: Array, dof: int, settings: Settings, factor: float, confidence: float = CONFIDENCE) -> Within | None:
+def within(nees: Array, dof: int, settings: Settings, factor: float) -> Within | None:
     """Ratio of true to stated covariance of one log, with an interval from how its NEES decorrelates.
 
     The mean of T values Y_k = NEES_k / dof has the variance s^2 tau / T with the integrated autocorrelation time tau,
@@ -189,7 +189,7 @@ def within(nees: Array, dof: int, settings: Settings, factor: float, confidence:
     doubt = 2.0 * (2.0 * reach + 1.0) / steps + max(fourth - 1.0, 0.0) * tau / steps  # variance of log(tau s^2)
     log_nu = np.log(2.0 * ratio**2 * steps / (spread * tau)) - np.sqrt(doubt)
     nu = float(np.exp(min(log_nu, np.log(dof * steps))))
-    z = float(distributions.t.isf(0.5 * (1.0 - confidence), max(2.0 / doubt, LEAST)))
+    z = float(distributions.t.isf(0.5 * (1.0 - CONFIDENCE), max(2.0 / doubt, LEAST)))
     low = float(distributions.chi2.ppf(special.ndtr(-z), nu)) / nu
     high = float(distributions.chi2.ppf(special.ndtr(z), nu)) / nu
     interval = Interval(ratio, ratio / high, ratio / max(low, 1e-300))

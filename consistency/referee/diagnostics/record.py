@@ -115,6 +115,17 @@ class RatioTable(NamedTuple):
 
 
 @dataclass(frozen=True)
+class BoundErrors:
+    """Errors over the bounds that are stated for them, which are judged in place of covariances."""
+
+    bounds: tuple[Bound, ...]
+    ratios: Array  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
+    regions: Array | None = None  # (runs, steps, bounds), places in REGIONS; NaN as the ratios, or without a limit
+
+    OF_RUNS: ClassVar = ("ratios", "regions")
+
+
+@dataclass(frozen=True)
 class Errors:
     """Errors of the estimates and the covariances stated for them, or their NEES alone.
 
@@ -134,13 +145,9 @@ class Errors:
     assumed: bool = False  # no covariance is stated: it is I, to be corrected
     convention: str = ""  # of the error
     ensemble: Ensemble | None = None  # of which the errors are normal numbers, as ranks among members are
-    bounds: tuple[Bound, ...] = ()  # that are judged in place of covariances
-    bound_ratios: Array | None = None  # (runs, steps, bounds), error over bound with its sign; NaN as the error is
-    regions: Array | None = (
-        None  # (runs, steps, bounds), places in REGIONS; NaN without an alert limit, or as the error
-    )
+    bounded: BoundErrors | None = None  # in place of the errors and covariances
 
-    OF_RUNS: ClassVar = ("error", "covariance", "nees", "bound_ratios", "regions")
+    OF_RUNS: ClassVar = ("error", "covariance", "nees", "bounded")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -223,7 +230,7 @@ class Origin:
     OF_RUNS: ClassVar = ("path",)
 
 
-OfRuns = TypeVar("OfRuns", Errors, InnovationRecord, Runs, Truth, Origin)
+OfRuns = TypeVar("OfRuns", BoundErrors, Errors, InnovationRecord, Runs, Truth, Origin)
 
 
 @dataclass(frozen=True, repr=False)
@@ -263,14 +270,7 @@ class Record:
         """Labels of the runs, (runs,)."""
         if self.runs.numbers is not None:
             return self.runs.numbers
-        there = (
-            self.errors.error,
-            self.errors.nees,
-            self.innovations.nis,
-            self.innovations.values,
-            self.errors.bound_ratios,
-        )
-        return np.arange(next((len(array) for array in there if array is not None), 0))
+        return np.arange(len(next(iter(arrays_of(self).values()), ())))
 
     def table(self, index: Sequence[int] | None = None) -> RatioTable | None:
         """What mean squares of some components together say of the covariance, or of all; None if they are its."""
@@ -356,9 +356,10 @@ class Record:
             "nis": self.innovations.nis,
             "nis_dof": self.innovations.nis_dof,
             "values": self.innovations.values,
-            "bound_ratios": self.errors.bound_ratios,
-            "regions": self.errors.regions,
         }
+        bounded = self.errors.bounded
+        if bounded is not None:
+            arrays |= {"ratios": bounded.ratios, "regions": bounded.regions}
         if self.world is not None:
             arrays |= {"world covariance": self.world.covariance, "world nees": self.world.nees}
         t = self.runs.times
@@ -368,18 +369,14 @@ class Record:
             rest, skipped = without_first(skip, arrays, self.name, t)
         except ValueError as error:
             raise InputError(f"--{error}") from None
+        if bounded is not None:
+            bounded = replace(bounded, ratios=rest["ratios"], regions=rest["regions"])
         world = self.world
         if world is not None:
             world = replace(world, covariance=rest["world covariance"], nees=rest["world nees"])
         return replace(
             self,
-            errors=replace(
-                self.errors,
-                covariance=rest["covariance"],
-                nees=rest["nees"],
-                bound_ratios=rest["bound_ratios"],
-                regions=rest["regions"],
-            ),
+            errors=replace(self.errors, covariance=rest["covariance"], nees=rest["nees"], bounded=bounded),
             innovations=replace(self.innovations, nis=rest["nis"], nis_dof=rest["nis_dof"], values=rest["values"]),
             runs=replace(self.runs, skipped=skipped),
             world=world,
@@ -392,8 +389,8 @@ class Record:
         if not self.runs.independent:
             return self
         judged = [values for values in (self.errors.nees, self.innovations.nis) if values is not None]
-        if self.errors.bound_ratios is not None:
-            judged += [*np.moveaxis(self.errors.bound_ratios, -1, 0)]
+        if self.errors.bounded is not None:
+            judged += [*np.moveaxis(self.errors.bounded.ratios, -1, 0)]
         there = np.any([np.isfinite(values) for values in judged], axis=0)
         number = np.arange(1, there.size + 1).reshape(there.shape)
         rows = [int(np.flatnonzero(self.run_numbers == f.run)[0]) for f in self.failures]
@@ -513,12 +510,20 @@ def shown_by(function: str, *arguments: Any) -> Any:
 
 def arrays_of(record: Record) -> dict[str, Any]:
     """Arrays over runs that a record has, by the name of their value and their own: "errors.nees"."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for part in ("errors", "innovations", "runs", "truth", "origin"):
-        value = getattr(record, part)
-        for name in value.OF_RUNS:
-            if (array := getattr(value, name)) is not None:
-                arrays[f"{part}.{name}"] = array
+        arrays |= _arrays(getattr(record, part), part)
+    return arrays
+
+
+def _arrays(value: OfRuns, prefix: str) -> dict[str, Any]:
+    arrays: dict[str, Any] = {}
+    for name in value.OF_RUNS:
+        part = getattr(value, name)
+        if isinstance(part, BoundErrors):
+            arrays |= _arrays(part, f"{prefix}.{name}")
+        elif part is not None:
+            arrays[f"{prefix}.{name}"] = part
     return arrays
 
 
@@ -526,8 +531,11 @@ def _changed(value: OfRuns, change: Callable[[Any], Any]) -> OfRuns:
     """A value with ``change`` applied to each of its arrays over runs."""
     arrays: dict[str, Any] = {}
     for name in value.OF_RUNS:
-        if (array := getattr(value, name)) is not None:
-            arrays[name] = change(array)
+        part = getattr(value, name)
+        if isinstance(part, BoundErrors):
+            arrays[name] = _changed(part, change)
+        elif part is not None:
+            arrays[name] = change(part)
     return replace(value, **arrays)
 
 

@@ -47,18 +47,6 @@ class Centre(NamedTuple):
         return np.where(counted[..., None], (error - self.mean) * self.factor, np.nan)
 
 
-class InGroup(NamedTuple):
-    """Runs that have a step in a group."""
-
-    means: Array  # (runs,), mean NEES over dof of their steps there
-    counts: Indices  # (runs,), of these steps
-
-    @property
-    def longest(self) -> int:
-        """Steps of the run that has most."""
-        return int(self.counts.max(initial=0))
-
-
 @dataclass(frozen=True)
 class Sample:
     """NEES of N runs in T steps; where errors of n components are known, these in units of their covariance.
@@ -113,15 +101,15 @@ class Sample:
         means, counts = run_means(self.nees[:, steps])
         return np.asarray(means[counts > 0] / self.dof)
 
-    def in_group(self, number: int) -> InGroup:
-        """The runs that have a step in a group."""
+    def in_group(self, number: int) -> RunMeans:
+        """Mean NEES over their steps in a group of the runs that have any."""
         assert self.groups is not None
 
         def of_block(nees: Array, index: Indices) -> Array:
             return means_and_counts(np.where(index == number, nees, np.nan))
 
         means, counts = by_runs(of_block, self.nees, self.groups.index).T
-        return InGroup(np.asarray(means[counts > 0] / self.dof), counts[counts > 0].astype(np.int64))
+        return RunMeans(means[counts > 0] / self.dof, counts[counts > 0].astype(np.int64), self.dof)
 
     @cached_property
     def counts(self) -> Indices:
@@ -279,21 +267,20 @@ def runs_and_steps(record: Record) -> tuple[int, int]:
     ValueError
         They do not agree, or nothing is there.
     """
-    dimensions = {"error": 3, "covariance": 4, "nees": 2, "nis": 2, "nis_dof": 2, "innovations": 3}
     arrays = {
-        "error": record.errors.error,
-        "covariance": record.errors.covariance,
-        "nees": record.errors.nees,
-        "nis": record.innovations.nis,
-        "nis_dof": record.innovations.nis_dof,
-        "innovations": record.innovations.values,
+        "error": (record.errors.error, "runs, steps, n"),
+        "covariance": (record.errors.covariance, "runs, steps, n, n"),
+        "nees": (record.errors.nees, "runs, steps"),
+        "nis": (record.innovations.nis, "runs, steps"),
+        "nis_dof": (record.innovations.nis_dof, "runs, steps"),
+        "innovations": (record.innovations.values, "runs, steps, n"),
     }
-    shapes = {name: np.shape(array) for name, array in arrays.items() if array is not None}
+    shapes = {name: np.shape(array) for name, (array, _) in arrays.items() if array is not None}
     if not set(shapes) - {"covariance", "nis_dof"}:
         raise ValueError("nothing to judge: give error and covariance, nees and dof, or nis and nis_dof")
     for name, shape in shapes.items():
-        if len(shape) != dimensions[name]:
-            expected = ", ".join(["runs", "steps", "n", "n"][: dimensions[name]])
+        expected = arrays[name][1]
+        if len(shape) != len(expected.split()):
             raise ValueError(f"{name} must be ({expected}), got shape {shape}")
     if len({shape[:2] for shape in shapes.values()}) > 1:
         raise ValueError(f"runs and steps differ: {', '.join(f'{n} {shape}' for n, shape in shapes.items())}")

@@ -161,7 +161,7 @@ class RunMeans:
             below = combined_p_value((below, first.below), (1.0 - EARLY, EARLY))
         return replace(test, above=max(test.above, above), below=max(test.below, below))
 
-    def by_steps(self, size: float, gaussian: bool) -> MeanTest:
+    def by_steps(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
         """:func:`scale_test` of runs weighted by their steps."""
         return scale_test(self.values / size, self.dof, self.steps, gaussian, self.counts)
 

@@ -10,7 +10,8 @@ import numpy as np
 from consistency.referee.diagnostics.nees import TWO_SIGMA
 from consistency.referee.diagnostics.number_of_runs import FEWEST_PLANNED
 from consistency.referee.diagnostics.number_words import (
-    MOST,
+    between_text,
+    first_few,
     is_or_are,
     is_uncertain,
     p_text,
@@ -33,7 +34,6 @@ from consistency.referee.diagnostics.verdict_parts import (
     Location,
     Scale,
     Settings,
-    Within,
 )
 
 SPREAD = 20.0  # worst over median run above which a mean says little: that run is named beside it
@@ -69,22 +69,16 @@ def reasons(v: Findings) -> list[str]:
 def _faults_of_parts(v: Findings) -> str:
     texts = []
     for name, part in v.parts.items():
-        if part.faults:
-            part = replace(_at_one_level(v, name, part), failures=())  # which are those of the whole
-            sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
-            texts.append(f"{name}: {sentence}")
-    if len(texts) > MOST:
-        texts = [*texts[:MOST], f"and {len(texts) - MOST} more"]
-    return "; ".join(texts)
-
-
-def _at_one_level(v: Findings, name: str, part: Findings) -> Findings:
-    """A part of one axis with the ratio that the whole states of that axis, whose intervals hold at once."""
-    if v.axes is None or name not in v.axes.names or part.scale is None:
-        return part
-    if part.location is not None and part.location.since is not None:
-        return part
-    return replace(part, scale=replace(part.scale, inflation=v.axes.inflation[name]))
+        if not part.faults:
+            continue
+        part = replace(part, failures=())  # which are those of the whole
+        begins_late = part.location is not None and part.location.since is not None
+        if v.axes is not None and name in v.axes.names and part.scale is not None and not begins_late:
+            # the whole states a ratio of that axis, too, with intervals that hold at once
+            part = replace(part, scale=replace(part.scale, inflation=v.axes.inflation[name]))
+        sentence = reasons(part)[0].removeprefix(f"{part.status}: ").removesuffix("; no bias found")
+        texts.append(f"{name}: {sentence}")
+    return "; ".join(first_few(texts))
 
 
 def details(v: Findings) -> list[str]:
@@ -94,9 +88,20 @@ def details(v: Findings) -> list[str]:
         lines.append(
             f"noncredibility index {v.accuracy.nci:.1f} dB, inclination {v.accuracy.inclination:+.1f} dB (0 if right)"
         )
-    if v.answers:
-        lines.append(_questions(v))
-    return lines
+    if not v.answers:
+        return lines
+    text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
+    if len(v.answers) > 1:
+        text += " together"
+    if not v.faults:
+        least = min(v.answers, key=lambda answer: answer.adjusted)
+        nearest = f"{question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
+        return [*lines, f"{text}; nearest to a fault: {nearest}"]
+    found = []
+    for answer in v.answers:
+        if answer.question in v.faults:
+            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
+    return [*lines, f"{text}; found: {', '.join(found)}"]
 
 
 def _sentence_and_figures(v: Findings) -> tuple[str, list[str]]:
@@ -217,11 +222,11 @@ def _no_fault(v: Findings, s: Scale) -> str:
 
         axis += right_groups(v)
     if shown.shown:
-        return f"{none} in {runs}, and the {size} is shown to be {_between(shown)}{axis}{_lost(v)}"
+        return f"{none} in {runs}, and the {size} is shown to be {between_text(shown)}{axis}{_lost(v)}"
     do = "do"
     if v.runs == 1:
         do = "does"
-    return f"{none}, but {runs} {do} not show the {size} to be {_between(shown)}{axis}{_advice(v, shown)}"
+    return f"{none}, but {runs} {do} not show the {size} to be {between_text(shown)}{axis}{_advice(v, shown)}"
 
 
 def _ratio_of_test(ratio: Interval, shown: Equivalence) -> str:
@@ -280,12 +285,6 @@ def _lost(v: Findings) -> str:
 def _has_lost(v: Findings) -> bool:
     """Whether lost runs are worth a word: an estimate of one step cannot get lost, unless a share is asked for."""
     return v.steps > 1 or v.unit != "run" or v.settings.lost is not None or bool(v.failures)
-
-
-def _between(shown: Equivalence) -> str:
-    if shown.one_sided:
-        return f"below {short(shown.factor)}"
-    return f"between {short(1.0 / shown.factor)} and {short(shown.factor)}"
 
 
 # --- the figures behind it -----------------------------------------------------------------------------
@@ -429,21 +428,18 @@ def _single_log(v: Findings, s: Scale) -> list[str]:
         return [
             "the log is too short to show how its errors decorrelate; further runs, or a far longer log, would decide"
         ]
-    return [_ratio_within(s.within, s.judged_steps, undecided)]
-
-
-def _ratio_within(w: Within, steps: int, undecided: bool) -> str:
+    w, steps = s.within, s.judged_steps
     text = (
         f"if errors go on to decorrelate as within this log (over {short(w.correlation)} steps), the covariance ratio "
         f"is {ratio_text(w.ratio)}, reported and not judged"
     )
     if not undecided or w.steps is None or w.pieces is None or w.steps > MOST_STEPS:
-        return text
+        return [text]
     if w.steps <= steps and w.correlation < MEMORYLESS:
         text += "; if rows do not depend on each other, as images or detections, --independent makes each a run"
     if w.steps <= steps:
-        return f"{text}; cut into {w.pieces} runs, this log would then probably decide"
-    return f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"
+        return [f"{text}; cut into {w.pieces} runs, this log would then probably decide"]
+    return [f"{text}; a log of {w.steps} steps, cut into {w.pieces} runs, would then probably decide"]
 
 
 def _together(v: Findings) -> list[str]:
@@ -487,7 +483,7 @@ def _without_truth(v: Findings, i: Innovations) -> str:
         if shown.shown:
             is_shown = "and their NIS per degree of freedom {} is shown to be"
         ratio = _ratio_of_test(Interval(i.ratio, *UNKNOWN_ENDS), shown)
-        parts.append(f"no fault found in the innovations, {is_shown.format(ratio)} {_between(shown)}")
+        parts.append(f"no fault found in the innovations, {is_shown.format(ratio)} {between_text(shown)}")
         if v.settings.lost is not None:
             parts.append("they cannot show what share of runs is lost")
     return "; ".join([*parts, "no truth: most pose errors cannot be seen"])
@@ -503,20 +499,6 @@ def _nis(i: Innovations) -> str:
     if len(i.autocorrelation):
         text += f", autocorrelation {i.autocorrelation[0]:+.3f} at lag 1 (within {i.bound:.3f} expected)"
     return text
-
-
-def _questions(v: Findings) -> str:
-    text = f"{plural(len(v.answers), 'question')} at a false-alarm rate of {v.settings.false_alarm:.3g}"
-    if len(v.answers) > 1:
-        text += " together"
-    if not v.faults:
-        least = min(v.answers, key=lambda answer: answer.adjusted)
-        return f"{text}; nearest to a fault: {question_text(v, least.question)} (corrected p {p_text(least.adjusted)})"
-    found = []
-    for answer in v.answers:
-        if answer.question in v.faults:
-            found.append(f"{question_text(v, answer.question)} (p {p_text(answer.adjusted)})")
-    return f"{text}; found: {', '.join(found)}"
 
 
 def question_text(v: Findings, question: str) -> str:
@@ -583,7 +565,7 @@ def same_truth(record: Record, found: Findings) -> list[str]:
     There it has to be worse than in most: a covariance that is too large throughout is so for another reason.
     """
     where = found.location
-    if record.origin.path is None or where is None or where.first_outside is None or len(record.origin.path) < FEWEST:
+    if record.origin.path is None or where is None or not where.steps_below or len(record.origin.path) < FEWEST:
         return []
     assert record.errors.nees is not None
     assert found.scale is not None

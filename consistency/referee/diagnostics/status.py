@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.diagnostics.error_parts import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.sample import Sample
-from consistency.referee.diagnostics.scale import MeanTest, scale_test, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.scale import MeanTest, RunMeans, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
@@ -35,7 +35,6 @@ from consistency.referee.diagnostics.verdict_parts import (
     at_share,
     faults_of,
 )
-from consistency.referee.types import Array
 
 if TYPE_CHECKING:
     from consistency.referee.diagnostics.maps import JointTest
@@ -166,7 +165,7 @@ def _with_joint(settings: Settings, faults: set[str], sample: Sample, tests: Tes
     if joint is None or JOINT not in faults:
         return _status_of_sample(settings, faults, sample, tests)
     together = _side(joint.score.both.value)
-    if not _robust(joint.means, joint.dof, 1, settings, 1):
+    if not _robust(RunMeans(joint.means, np.ones(len(joint.means), int), joint.dof), settings, 1):
         together = "heavy-tailed"
     if not faults & set(SCALE):
         return together
@@ -190,7 +189,7 @@ def _status_of_sample(settings: Settings, faults: set[str], sample: Sample, test
     """The status by the errors of a sample: of the scale only where it does not depend on a few large errors."""
     of_groups = _sides(settings, tests.groups) if GROUP in faults else set()
     if MAIN in faults:
-        if not _robust(sample.means(), sample.dof, sample.longest, settings, 1):
+        if not _robust(sample.run_means(), settings, 1):
             return "heavy-tailed"
         if AXIS in faults and _contradicted(settings, sample, tests):
             return "inconsistent"
@@ -254,19 +253,20 @@ def _rank(sample: Sample, step: int) -> float:
     return float(np.clip(square / max(float(np.square(M).sum()) - square / len(w), TINY), 1.0, sample.dof))
 
 
-def _robust(
-    means: Array, dof: int, steps: int, settings: Settings, questions: int, weights: Array | None = None
-) -> bool:
+def _robust(runs: RunMeans, settings: Settings, questions: int, weighted: bool = False) -> bool:
     """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
-    test = scale_test(means, dof, steps, not spreads_more(means, dof), weights)
-    return bool(sided_p_value(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm)
+    test = runs.name
+    if weighted:
+        test = runs.by_steps
+    p_value = sided_p_value(test(gaussian=not spreads_more(runs.values, runs.dof)), settings)
+    return p_value * questions <= SHARES[MAIN] * settings.false_alarm
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
     groups = sample.components
     for key, test in tests.axes.items():
         found = sided_p_value(test, settings) * len(groups) <= settings.false_alarm
-        if found and _robust(sample.group_means(groups[key]), len(groups[key]), sample.longest, settings, len(groups)):
+        if found and _robust(sample.run_means(groups[key]), settings, len(groups)):
             return True
     return False
 
@@ -274,9 +274,8 @@ def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:
 def _robust_group(sample: Sample, tests: Tests, settings: Settings) -> bool:
     """Is some group found at fault too where the runs differ more than Gaussian errors can?"""
     for number, test in enumerate(tests.groups):
-        one = sample.in_group(number)
         found = sided_p_value(test, settings) * len(tests.groups) <= settings.false_alarm
-        if found and _robust(one.means, sample.dof, one.longest, settings, len(tests.groups), one.counts):
+        if found and _robust(sample.in_group(number), settings, len(tests.groups), weighted=True):
             return True
     return False
 

@@ -275,7 +275,16 @@ class UncertainTruth:
         found = parts.with_ratios(self._of_P)
         assert found.scale is not None
         if self.bounded:
-            found = found._replace(scale=replace(found.scale, accepted=self._accepted(answers, settings)))
+            # of the mean NEES by both covariances; too large a covariance shows by P
+            rate = at_share(answers, settings).false_alarm * SHARES[MAIN]
+            if not settings.one_sided:
+                rate /= 2.0
+            weights = upper_weights(self.by_group[MAIN])
+            high = beyond(weights)
+            if upper_tail(high, weights) > rate:
+                high = float(optimize.brentq(lambda x: upper_tail(x, weights) - rate, high, 1e6 * high))
+            accepted = 0.0, high * self._together * self.total.dof
+            found = found._replace(scale=replace(found.scale, accepted=accepted))
         return found._replace(by_group=parts.by_group)
 
     def status(self, status: str, answers: Sequence[Answer], settings: Settings) -> str:
@@ -298,17 +307,6 @@ class UncertainTruth:
         if any(above < below for above, below in tails):
             return "inconsistent"
         return "conservative"
-
-    def _accepted(self, answers: Sequence[Answer], settings: Settings) -> tuple[float, float]:
-        """Interval of the mean NEES by both covariances that is not a fault of scale; too large a one shows by P."""
-        rate = at_share(answers, settings).false_alarm * SHARES[MAIN]
-        if not settings.one_sided:
-            rate /= 2.0
-        weights = upper_weights(self.by_group[MAIN])
-        high = beyond(weights)
-        if upper_tail(high, weights) > rate:
-            high = float(optimize.brentq(lambda x: upper_tail(x, weights) - rate, high, 1e6 * high))
-        return 0.0, high * self._together * self.total.dof
 
     def _of_P(self, of_both: Interval, group: str) -> Interval:
         """Ratio of P from that of both covariances; with its widest interval where only bounds hold."""

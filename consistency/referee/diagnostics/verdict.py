@@ -16,6 +16,7 @@ import numpy as np
 from consistency.referee.diagnostics.record import Record, Skipped, shown_by
 from consistency.referee.diagnostics.verdict_parts import (
     REGIONS,
+    SIDES,
     TINY,
     Accuracy,
     Answer,
@@ -36,7 +37,6 @@ from consistency.referee.diagnostics.verdict_parts import (
     Shape,
     Tails,
     TruthShare,
-    Within,
     faults_of,
 )
 from consistency.referee.errors import InputError
@@ -123,24 +123,16 @@ class Findings:
         """Component whose ratio is farthest from 1, on the side of a fault of the scale; None if there is only one."""
         if self.axes is None or len(self.axes.names) < 2:
             return None
-        side = 0.0
-        if self.status == "overconfident":
-            side = 1.0
-        elif self.status == "conservative":
-            side = -1.0
-        elif self.settings.one_sided:
-            side = 1.0
-        worst = None
-        farthest = -np.inf
-        for axis, interval in self.axes.inflation.items():
-            log = float(np.log(max(interval.value, TINY)))
-            if axis not in self.axes.names or not np.isfinite(log):
-                continue
-            distance = side * log if side else abs(log)
-            if distance > farthest:
-                worst = (axis, interval)
-                farthest = distance
-        return worst
+        side = SIDES.get(self.status, int(self.settings.one_sided))
+        distances = {}
+        for axis in self.axes.names:
+            log = float(np.log(max(self.axes.inflation[axis].value, TINY)))
+            if np.isfinite(log):
+                distances[axis] = side * log if side else abs(log)
+        if not distances:
+            return None
+        worst = max(distances, key=distances.__getitem__)
+        return worst, self.axes.inflation[worst]
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -323,10 +315,6 @@ def _axes_numbers(v: Verdict, axes: ComponentRatios) -> dict[str, Any]:
     return numbers
 
 
-def _guess_numbers(guesses: Mapping[str, ConventionResult]) -> dict[str, Any]:
-    return {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}
-
-
 def _map_numbers(score: MapScore) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "map_ratio": score.ratio.value,
@@ -374,7 +362,7 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
         (v.rejection, rejection_numbers),
         (v.ends, ends_numbers),
         (v.skipped, skipped_numbers),
-        (v.guesses or None, _guess_numbers),
+        (v.guesses or None, lambda guesses: {"guesses": {kind: guess._asdict() for kind, guess in guesses.items()}}),
         (v.truth, truth_numbers),
         (v.by_group, group_numbers),
         (v.bounds or None, bound_numbers),
@@ -393,6 +381,16 @@ def _statistics_of(v: Verdict) -> dict[str, Any]:
 
 
 def scale_numbers(scale: Scale) -> Numbers:
+    within: Numbers | None = None
+    if scale.within is not None:
+        within = {
+            "ratio": scale.within.ratio.value,
+            "ratio_interval": tuple(scale.within.ratio[1:]),
+            "correlation_steps": scale.within.correlation,
+            "effective_dof": scale.within.effective_dof,
+            "deciding_steps": scale.within.steps,
+            "deciding_pieces": scale.within.pieces,
+        }
     return {
         "dof": scale.dof,
         "anees": scale.anees,
@@ -409,20 +407,7 @@ def scale_numbers(scale: Scale) -> Numbers:
         "worst_run": scale.worst_run,
         "share_inside": scale.share_inside,
         "equivalence": equivalence_numbers(scale.equivalence),
-        "within": _of_within(scale.within),
-    }
-
-
-def _of_within(within: Within | None) -> Numbers | None:
-    if within is None:
-        return None
-    return {
-        "ratio": within.ratio.value,
-        "ratio_interval": tuple(within.ratio[1:]),
-        "correlation_steps": within.correlation,
-        "effective_dof": within.effective_dof,
-        "deciding_steps": within.steps,
-        "deciding_pieces": within.pieces,
+        "within": within,
     }
 
 

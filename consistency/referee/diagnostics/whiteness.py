@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,8 +131,14 @@ def nis_whiteness(nis: Array, dof: Array, lags: int = LAGS) -> Whiteness:
     if not counted.any():
         return _portmanteau(np.full((*np.shape(nis), 1), np.nan), lags)
     overall = float(nis[counted].sum() / dof[counted].sum())
-    standard = functools.partial(_cube_root, overall, *cube_root_moments(np.arange(int(dof[counted].max()) + 1)))
-    u = by_runs(standard, nis, dof)
+    mean, deviation = cube_root_moments(np.arange(int(dof[counted].max()) + 1))
+
+    def standardised(nis: Array, dof: Array) -> Array:
+        n = np.where(np.isfinite(nis) & (dof > 0), dof, 0).astype(int)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((np.cbrt(nis / (n * overall)) - mean[n]) / deviation[n])
+
+    u = by_runs(standardised, nis, dof)
     u -= np.nanmean(u) if overall > 0 else np.nan
     return _portmanteau(u[..., None], lags)
 
@@ -146,14 +151,6 @@ def cube_root_moments(dof: Array) -> tuple[Array, Array]:
     half = np.where(dof > 0, 0.5 * dof, np.nan)
     mean, square = (half**-r * special.poch(half, r) for r in (1 / 3, 2 / 3))
     return mean, np.sqrt(square - mean**2)
-
-
-def _cube_root(overall: float, mean: Array, deviation: Array, nis: Array, dof: Array) -> Array:
-    """Cube root of NIS / ``overall`` (runs, steps), standardised by the moments (dof + 1,) of each dof."""
-    counted = np.isfinite(nis) & (dof > 0)
-    n = np.where(counted, dof, 0).astype(int)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((np.cbrt(nis / (n * overall)) - mean[n]) / deviation[n])
 
 
 def _portmanteau(u: Array, lags: int) -> Whiteness:

@@ -127,16 +127,16 @@ def whiten_group(error: Array, covariance: Array, index: Sequence[int]) -> Array
 
 def squared_length(whitened: Array) -> Array:
     """(runs, steps, n) -> (runs, steps): the NEES, if nothing is missing."""
-    return by_runs(_squared_length, whitened)
 
+    def of_block(w: Array) -> Array:
+        if w.shape[-1] > FEW:
+            return np.asarray(np.square(w).sum(axis=-1))
+        total = np.square(w[..., 0])
+        for i in range(1, w.shape[-1]):
+            total = total + np.square(w[..., i])
+        return np.asarray(total)
 
-def _squared_length(w: Array) -> Array:
-    if w.shape[-1] > FEW:
-        return np.asarray(np.square(w).sum(axis=-1))
-    total = np.square(w[..., 0])
-    for i in range(1, w.shape[-1]):
-        total = total + np.square(w[..., i])
-    return np.asarray(total)
+    return by_runs(of_block, whitened)
 
 
 def all_finite(values: Array) -> Array:
@@ -223,24 +223,23 @@ def classify(covariance: Array, tolerance: Tolerance = EXACT) -> Indices:
     Rank is judged by the smallest eigenvalue of the correlation matrix, where a component whose variance is zero has
     the variance 1 and the covariances that it has.
     """
-    P = covariance.reshape(-1, *covariance.shape[-2:])
-    return by_runs(lambda some: _classify(some, tolerance), P).reshape(covariance.shape[:-2])
 
+    def of_block(matrices: Array) -> Indices:
+        finite = np.isfinite(matrices).all(axis=(-2, -1))
+        out = np.full(len(matrices), Validity.NOT_FINITE, dtype=np.int64)
+        P = matrices[finite]
+        variance = np.diagonal(P, axis1=-2, axis2=-1)
+        none = np.abs(variance) <= tolerance.zero
+        scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
+        smallest = np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[:, 0]
+        smallest = np.where(none.any(axis=-1), np.minimum(smallest, 0.0), smallest)
+        kind = np.where(smallest > DEFICIENT, Validity.VALID, Validity.DEFICIENT)
+        kind[smallest < -tolerance.indefinite] = Validity.INDEFINITE
+        kind[asymmetric(P, tolerance)] = Validity.ASYMMETRIC
+        out[finite] = kind
+        return out
 
-def _classify(P: Array, tolerance: Tolerance) -> Indices:
-    finite = np.isfinite(P).all(axis=(-2, -1))
-    out = np.full(len(P), Validity.NOT_FINITE, dtype=np.int64)
-    P = P[finite]
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    none = np.abs(variance) <= tolerance.zero
-    scale = np.where(none, 1.0, np.sqrt(np.abs(variance)))
-    smallest = np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[:, 0]
-    smallest = np.where(none.any(axis=-1), np.minimum(smallest, 0.0), smallest)
-    kind = np.where(smallest > DEFICIENT, Validity.VALID, Validity.DEFICIENT)
-    kind[smallest < -tolerance.indefinite] = Validity.INDEFINITE
-    kind[asymmetric(P, tolerance)] = Validity.ASYMMETRIC
-    out[finite] = kind
-    return out
+    return by_runs(of_block, covariance.reshape(-1, *covariance.shape[-2:])).reshape(covariance.shape[:-2])
 
 
 def asymmetric(covariance: Array, tolerance: Tolerance = EXACT) -> Array:

@@ -209,7 +209,7 @@ def correct(
         record = rows_as_declared(record)
         record = replace(record, errors=replace(record.errors, assumed=covariances is None))
     labels = tuple(map(str, record.run_numbers if names is None else names))
-    if record.errors.bounds:
+    if record.errors.bounded:
         if per_axis:
             raise InputError("--per axis: is for covariances; each bound has a factor of its own")
         return correct_bounds(record, labels, held_out)

@@ -15,7 +15,7 @@ import numpy as np
 from consistency.referee.diagnostics.bound_words import factor_text, level_text
 from consistency.referee.diagnostics.exceedance import Exceedance, fewest_fitted
 from consistency.referee.diagnostics.number_words import percent, plural, short
-from consistency.referee.diagnostics.record import Bound, Map, Record
+from consistency.referee.diagnostics.record import Bound, BoundErrors, Map, Record
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval
 from consistency.referee.errors import InputError
@@ -96,28 +96,31 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
     InputError
         There are fewer runs than a level takes; or a name is not there.
     """
-    assert record.errors.bound_ratios is not None
+    assert record.errors.bounded is not None
     require_fixed_groups(record)
-    counted = np.asarray((~np.isnan(record.errors.bound_ratios)).any(axis=(1, 2)))
+    counted = np.asarray((~np.isnan(record.errors.bounded.ratios)).any(axis=(1, 2)))
     fitted, judged = fitted_and_judged(labels, counted, held_out)
     fit = record.of_runs(fitted)
-    factors = tuple(factor for b in range(len(record.errors.bounds)) for factor in _factors(fit, b, held_out is None))
+    factors = tuple(
+        factor for b in range(len(record.errors.bounded.bounds)) for factor in _factors(fit, b, held_out is None)
+    )
     some = replace(record, map=Map(), world=None).of_runs(judged)
-    assert some.errors.bound_ratios is not None
+    stated = some.errors.bounded
+    assert stated is not None
     place = {run: row for row, run in enumerate(fitted)}
-    ratios = some.errors.bound_ratios.copy()
+    ratios = stated.ratios.copy()
     index = np.zeros(ratios.shape[:2], int) if some.groups is None else some.groups.index
     for factor in factors:
-        b = [bound.name for bound in some.errors.bounds].index(factor.bound.name)
+        b = [bound.name for bound in stated.bounds].index(factor.bound.name)
         own = [factor.left_out[place[run]] if run in place else factor.factor for run in judged]
         names = ("",) if some.groups is None else some.groups.names
         in_group = index == names.index(factor.group) if factor.group or some.groups is None else index < 0
-        ratios[..., b] = np.where(in_group, some.errors.bound_ratios[..., b] / np.array(own)[:, None], ratios[..., b])
-    some = replace(some, errors=replace(some.errors, regions=None))  # of the bounds as they are stated
-    corrected = replace(some, errors=replace(some.errors, bound_ratios=ratios))
+        ratios[..., b] = np.where(in_group, stated.ratios[..., b] / np.array(own)[:, None], ratios[..., b])
+    some = _over_bounds(some, BoundErrors(stated.bounds, stated.ratios))  # regions are of bounds as they are stated
+    corrected = _over_bounds(some, BoundErrors(stated.bounds, ratios))
     rates = {
         bound.name: Exceedance(np.abs(ratios[..., b]), np.zeros(len(ratios), int), bound.level).rate_interval()
-        for b, bound in enumerate(some.errors.bounds)
+        for b, bound in enumerate(stated.bounds)
     }
     before, after = (judge_all([each])[record.name] for each in (some, corrected))
     names_of = tuple(labels[i] for i in fitted), tuple(labels[i] for i in judged)
@@ -125,11 +128,15 @@ def correct_bounds(record: Record, labels: Sequence[str], held_out: str | None) 
     return BoundCorrection(record.name, factors, held_out or IN_TURN, *names_of, numbers, before, after, rates)
 
 
+def _over_bounds(record: Record, bounded: BoundErrors) -> Record:
+    return replace(record, errors=replace(record.errors, bounded=bounded))
+
+
 def _factors(record: Record, b: int, in_turn: bool) -> list[BoundFactor]:
     """Factors of a bound in each group, and last in all steps; a group of too few runs has that of all."""
-    assert record.errors.bound_ratios is not None
-    bound = record.errors.bounds[b]
-    sizes = np.abs(record.errors.bound_ratios[..., b])
+    assert record.errors.bounded is not None
+    bound = record.errors.bounded.bounds[b]
+    sizes = np.abs(record.errors.bounded.ratios[..., b])
     least = fewest_fitted(bound.level) + in_turn
     there = int((~np.isnan(sizes)).any(axis=1).sum())
     if there < least:

@@ -120,10 +120,11 @@ def planned_runs(record: Record, terms: Terms | Settings, rate: float) -> int:
 
     Of bounds those that show right ones, however steps depend on each other; a million at most.
     """
-    if record.errors.bounds:
+    bounded = record.errors.bounded
+    if bounded is not None:
         from consistency.referee.diagnostics.exceedance import LARGEST, runs_to_show
 
-        return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in record.errors.bounds)
+        return max(runs_to_show(bound.level, terms.detect, terms.power) or LARGEST for bound in bounded.bounds)
     detect = planned_detect(record, terms.detect)
     return gate_runs(planned_dof(record), detect, rate / rate_shares(record), terms.power, terms.allow, terms.lost)
 

@@ -316,16 +316,17 @@ def draw_bounded(axes: Axes, x: Array, error: Array, bound: Array, label: str) -
 
 def _bounded(record: Record) -> Picture | None:
     """Errors over the bounds that are stated for them."""
-    ratios = record.errors.bound_ratios
-    if ratios is None:
+    bounded = record.errors.bounded
+    if bounded is None:
         return None
+    ratios, bounds = bounded.ratios, bounded.bounds
     clock, row = time_axis_of(record.runs.t), shown_run(record)
 
     def panel(number: int) -> Paint:
         def paint(axes: Axes) -> None:
             of = ratios[..., number]
             reach = max(1.5, 1.1 * _most(of))
-            axes.set(ylabel=record.errors.bounds[number].name, ylim=(-reach if (of < 0.0).any() else 0.0, reach))
+            axes.set(ylabel=bounds[number].name, ylim=(-reach if (of < 0.0).any() else 0.0, reach))
             axes.axhspan(-1.0, 1.0, color=INSIDE, linewidth=0, zorder=0.4, label="inside the bound")
             if has_one_step(record):
                 points(axes, record.run_numbers.astype(float), of[:, 0], EACH_RUN, f"error of a {record.runs.unit}")
@@ -582,8 +583,10 @@ def of_component(number: int) -> Look:
 
 def shown_run(record: Record) -> int:
     """Row of the run that is drawn: the first that reaches furthest."""
-    values = record.errors.bound_ratios if record.errors.error is None else record.errors.error
-    assert values is not None
+    values = record.errors.error
+    if values is None:
+        assert record.errors.bounded is not None
+        values = record.errors.bounded.ratios
     return int(np.argmax(np.isfinite(values).all(axis=-1).sum(axis=1)))
 
 

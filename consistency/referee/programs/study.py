@@ -544,7 +544,7 @@ def _require_looks(records: Sequence[Record]) -> None:
     """Refuse records whose verdict has no form for looks at growing numbers of runs."""
     for record in records:
         if (
-            record.errors.bounds
+            record.errors.bounded
             or record.errors.ensemble is not None
             or record.errors.parts
             or record.runs.independent

@@ -20,6 +20,8 @@ from consistency.referee.diagnostics.nees import nees
 from consistency.referee.diagnostics.number_words import plural, short
 from consistency.referee.diagnostics.record import (
     INDEFINITE,
+    Bound,
+    BoundErrors,
     Errors,
     InnovationRecord,
     Origin,
@@ -120,6 +122,7 @@ def assemble(
     notes: Sequence[str] = (),
     may_end: bool = False,
     independent: bool = False,
+    bounds: tuple[Bound, ...] = (),
 ) -> Record:
     """Assemble tracks on the common steps, find failures, and leave out exactly known starts.
 
@@ -130,6 +133,7 @@ def assemble(
     file : where the estimates are from, for messages
     may_end : a run that ends before the others is not a sign of a broken filter
     independent : rows are independent, so that a broken one fails alone, and the run continues
+    bounds : over which the tracks have errors
 
     Raises
     ------
@@ -172,6 +176,9 @@ def assemble(
             "if the filter broke down there, write a row of NaN, so that the failure counts"
         )
     dof = len(axes) if arrays["error"] is not None else 0
+    bounded = None
+    if arrays["bound_ratios"] is not None:
+        bounded = BoundErrors(bounds, arrays["bound_ratios"], arrays["regions"])
     numbers = np.array([track.run for track in tracks], dtype=np.int64)
     return Record(
         name,
@@ -182,8 +189,7 @@ def assemble(
             dof,
             axes,
             convention=convention,
-            bound_ratios=arrays["bound_ratios"],
-            regions=arrays["regions"],
+            bounded=bounded,
         ),
         InnovationRecord(arrays["nis"], arrays["nis_dof"]),
         Runs(numbers, t=t, times=arrays["t"], by=arrays["by"]),

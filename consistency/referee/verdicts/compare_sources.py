@@ -252,7 +252,7 @@ def baseline(
         raise InputError(f"{name}: has no truth; only filters with a NEES can be compared")
     for each in source.filters:
         record = source.record(each).without_first(first)
-        if record.errors.bounds:
+        if record.errors.bounded:
             raise InputError(
                 f"{record.name}: bounds are not compared: 'analyse' finds the factor of each estimator, with its "
                 "interval; with --gaussian bounds are read as covariances, which are"

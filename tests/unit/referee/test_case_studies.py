@@ -27,7 +27,6 @@ import page  # noqa: E402
 import study  # noqa: E402
 
 VERSIONS = ("4.2.1", "4.3.0")
-RATIO = re.compile(r"x\d+\.\d+ \[\d+\.\d+, \d+\.\d+\]")
 EXPECTED = 3.20  # tr(P^-1 P') / 9, with P of preintMeasCov() and P' of residualCovariance() of 4.3.0 without noise
 ROWS = {  # of gtsam_imu.py, and their archives
     "the factor at the truth": "",

@@ -108,21 +108,10 @@ def test_an_oblique_fault_is_found(fault, n, world):
     draws = [verdict_on(fault(world(rng, 100, 60, n)), allow="conservative") for _ in range(5)]
     found = [v for v in draws if "scale in some direction" in v.faults]
     assert len(found) >= 4
+    assert not any("too large" in v.reasons[0] for v in found)
     if fault is correlated:
         assert {v.status for v in found} == {"overconfident"}
         assert any("in the direction" in v.reasons[0] for v in found)
-
-
-def test_the_sentence_on_an_oblique_fault_names_what_is_too_small():
-    """x1.6 along (1, 1, 1, 1, 1, 1), the rest x0.7: every axis by itself is too large, and the direction is named."""
-    rng, u = np.random.default_rng(53), np.full(6, 6**-0.5)
-    for _ in range(5):
-        w = np.sqrt(0.7) * independent(rng, 100, 60, 6)
-        w += (np.sqrt(1.6 / 0.7) - 1.0) * (w @ u)[..., None] * u
-        text = verdict_on(w, allow="conservative").reasons[0]
-        assert "too large" not in text
-        assert "covariance too small by x1." in text
-        assert "in the direction +0." in text
 
 
 def test_the_sentence_names_the_direction():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from draws import independent
+from draws import independent, verdict_on
 from records import changed
 
 from consistency.diagnostics import Settings, judge, make_record
@@ -83,7 +83,7 @@ def test_heavy_tails_in_a_few_steps_keep_their_name_beside_steps_below_the_band(
     error = independent(rng, 60, 120, 3)
     error[:, 30:36] *= np.where(np.arange(60) % 20 == 0, 12.0, 1.0)[:, None, None]
     error[:, :small] *= 0.3
-    verdict = judge(make_record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings())
+    verdict = verdict_on(error)
     assert verdict.location.steps_below >= small
     assert verdict.status == "heavy-tailed"
 
@@ -92,7 +92,7 @@ def test_heavy_tails_in_a_step_below_the_band_keep_their_name(rng):
     """Errors of step 31 are a tenth as large, but in one run of 5."""
     error = independent(rng, 60, 120, 3)
     error[:, 30] *= np.where(np.arange(60) % 5 == 0, 1.0, 0.1)[:, None]
-    verdict = judge(make_record("t", error, np.tile(np.eye(3), (60, 120, 1, 1))), Settings(SURE))
+    verdict = verdict_on(error, false_alarm=SURE)
     assert (verdict.location.steps_above, verdict.location.steps_below) == (0, 1)
     assert verdict.faults == ("scale in some step",)
     assert verdict.status == "heavy-tailed"
@@ -103,5 +103,4 @@ def test_one_axis_in_a_few_steps_is_not_heavy_tailed(rng, ratio):
     """Its NEES spreads as that of one degree of freedom, which is no heavy tail."""
     error = independent(rng, 60, 60, 3)
     error[:, 20:24, 0] *= np.sqrt(ratio)
-    verdict = judge(make_record("axis", error, np.tile(np.eye(3), (60, 60, 1, 1))), Settings(SURE))
-    assert verdict.status == "overconfident"
+    assert verdict_on(error, false_alarm=SURE).status == "overconfident"

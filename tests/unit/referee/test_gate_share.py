@@ -67,8 +67,6 @@ def test_rejections_right_after_another_do_not_count():
     assert (fed([1.0], dof=0).tried, fed([np.nan]).refused) == (0, 1)
     assert fed([9.0, *[1.0] * 5, 9.0], gate=0.95).refused == 2
     assert fed([9.0, *[1.0] * 4, 9.0], gate=0.95).refused == 1
-    monitor.reset()
-    assert (monitor.refused, monitor.tried, monitor.gate_share) == (0, 0, None)
     assert (fed([1.0], gate=None).gate_share, fed([1.0], gate=None).smallest_spikes) == (None, {})
 
 

@@ -99,14 +99,6 @@ def test_a_share_out_of_range_is_refused():
 # --- verdicts --------------------------------------------------------------------------------------------
 
 
-def test_what_stays_open_is_said():
-    verdict = verdict_on(right(50))
-    assert verdict.status == "consistent"
-    assert verdict.reasons[0].endswith("; up to 5.8 % of runs may still be lost or have a wrong covariance")
-    assert verdict.statistics["lost"]["upper"] == pytest.approx(1.0 - 0.05 ** (1 / 50))
-    assert verdict.statistics["lost"]["asked"] is None
-
-
 @pytest.mark.parametrize("runs, status", [(58, "undecided"), (59, "consistent")])
 def test_a_share_that_is_asked_for_takes_its_runs(runs, status):
     verdict = verdict_on(right(runs), lost=0.05)

@@ -34,6 +34,10 @@ def drawn(seed, m=10, runs=80, steps=5, ratio=1.0, root=ROOT):
     return np.sqrt(ratio) * z[:, :, 0], z[:, :, 1:]
 
 
+def judged(truth, members, **options):
+    return cs.judge(members=members, truth=truth, **{"false_alarm": RARE} | options)
+
+
 def mean_and_covariance(truth, members):
     mean = members.mean(axis=2)
     c = members - mean[:, :, None]
@@ -143,8 +147,7 @@ def test_a_number_far_in_the_tail_is_finite():
 
 
 def test_right_members_are_consistent():
-    truth, members = drawn(13, 20, 200)
-    verdict = cs.judge(members=members, truth=truth, axes=["x", "y", "z"], false_alarm=RARE)
+    verdict = judged(*drawn(13, 20, 200), axes=["x", "y", "z"])
     assert verdict.status == "consistent"
     assert list(verdict.parts) == ["x", "y", "z", TOGETHER]
     assert verdict.scale.equivalence.factor == verdict.settings.detect == 1.5
@@ -154,7 +157,7 @@ def test_right_members_are_consistent():
 @pytest.mark.parametrize("ratio, status", [(4.0, "overconfident"), (0.25, "conservative")])
 def test_the_ratio_of_wrong_members_is_that_of_their_covariance(ratio, status):
     truth, members = drawn(14, 10, 200, ratio=ratio)
-    verdict = cs.judge(members=members, truth=truth, false_alarm=RARE)
+    verdict = judged(truth, members)
     assert verdict.status == status
     assert verdict.inflation == pytest.approx(ratio, rel=0.25)
     for part in verdict.parts.values():
@@ -173,16 +176,14 @@ def test_biased_members_are_biased():
 
 def test_few_members_do_not_make_a_wrong_ensemble_consistent():
     """m = 3 shows a ratio of 2.25 as 1.20, far inside [1 / 1.5, 1.5]."""
-    truth, members = drawn(16, 3, 400, ratio=2.25, root=np.eye(1))
-    verdict = cs.judge(members=members, truth=truth, false_alarm=RARE)
+    verdict = judged(*drawn(16, 3, 400, ratio=2.25, root=np.eye(1)))
     assert verdict.status != "consistent"
     assert 0.67 < verdict.scale.mean_anees < 1.4
     assert verdict.scale.equivalence.interval[1] > 1.5
 
 
 def test_a_ratio_beyond_what_members_show_is_a_bound():
-    truth, members = drawn(34, 3, 60, ratio=1e6, root=np.eye(1))
-    verdict = cs.judge(members=members, truth=truth)
+    verdict = judged(*drawn(34, 3, 60, ratio=1e6, root=np.eye(1)))
     assert verdict.inflation_interval[1] == np.inf
     assert verdict.inflation_interval[0] > 5.0
     assert "at least x" in verdict.reasons[0]
@@ -191,18 +192,16 @@ def test_a_ratio_beyond_what_members_show_is_a_bound():
 
 def test_few_right_members_are_undecided():
     """m = 3 must show mean squares within 1.10 of 1, which 60 runs do not, though they show them within 1.5."""
-    truth, members = drawn(32, 3, 60, root=np.eye(1))
-    verdict = cs.judge(members=members, truth=truth, false_alarm=RARE)
+    verdict = judged(*drawn(32, 3, 60, root=np.eye(1)))
     assert verdict.status == "undecided"
     assert 0.75 < verdict.scale.mean_anees < 1.3
 
 
 def test_the_tolerance_is_of_the_covariance():
     """m = 5 shows a ratio of 1.7 as 1.2."""
-    truth, members = drawn(17, 5, 600, ratio=1.7, root=np.eye(1))
-    assert cs.judge(members=members, truth=truth).status == "overconfident"
-    assert cs.judge(members=members, truth=truth, tolerance=1.4).status == "overconfident"
-    assert cs.judge(members=members, truth=truth, tolerance=2.5, detect=2.5, false_alarm=1e-3).status == "consistent"
+    wrong = drawn(17, 5, 600, ratio=1.7, root=np.eye(1))
+    assert judged(*wrong, false_alarm=0.05, tolerance=1.4).status == "overconfident"
+    assert judged(*wrong, false_alarm=1e-3, tolerance=2.5, detect=2.5).status == "consistent"
 
 
 def test_groups_have_ratios_of_the_covariance():
@@ -348,12 +347,12 @@ def test_files_of_repeats_are_judged_as_arrays_are(tmp_path, monkeypatch):
 
 def test_ranks_are_drawn(tmp_path):
     truth, members = drawn(29, 40, 50, 4)
-    verdict = cs.judge(members=members, truth=truth, axes=["x", "y", "z"])
+    verdict = judged(truth, members, axes=["x", "y", "z"])
     shares, width = rank_shares(verdict.record)
     assert list(shares) == ["x", "y", "z"]
     assert all(len(share) == 21 and share.sum() == pytest.approx(1.0) for share in shares.values())
     assert 0.02 < width < 0.08  # 3.0 of sqrt(1 / 21 / 200) = .015
-    far = cs.judge(members=0.2 * members, truth=truth, axes=["x", "y", "z"]).record
+    far = judged(truth, 0.2 * members, axes=["x", "y", "z"]).record
     assert rank_shares(far)[0]["x"][[0, -1]].min() > 0.2
     figures = {figure.title: figure for figure in record_figures(verdict.record, verdict)}
     for title in ("Ranks among the members", "Spread and skill"):
@@ -435,16 +434,16 @@ def unit(runs, n=3):
 def test_gates_take_members_and_plan_for_what_they_show():
     truth, members = drawn(28, 20, 300)
     verdict = assert_consistent(members=members, truth=truth, axes=["x", "y", "z"], false_alarm=RARE)
-    judged = cs.judge(members=members, truth=truth, axes=["x", "y", "z"], false_alarm=RARE)
-    assert (verdict.p_value, verdict.inflation) == (judged.p_value, judged.inflation)
+    same = judged(truth, members, axes=["x", "y", "z"])
+    assert (verdict.p_value, verdict.inflation) == (same.p_value, same.inflation)
     with pytest.raises(ConsistencyError, match="overconfident"):
         assert_consistent(members=members, truth=2 * truth)
     with pytest.raises(InsufficientTrials, match=r"--dof 1 --detect 1\.318 --false-alarm 2e-06") as few:
         assert_consistent(members=members[:20], truth=truth[:20], false_alarm=4 * 2e-6)
     assert 1.318 <= min(table.factor(1.5) for table in rank_tables(20, 3)) <= 1.319
     assert few.value.needed >= gate_runs(1, 1.318, 2e-6)
-    assert planned_detect(judged.record, 1 / 1.5) == pytest.approx(1 / 1.318)
-    assert planned_detect(judged.record, 1.0001) == 1.001
+    assert planned_detect(same.record, 1 / 1.5) == pytest.approx(1 / 1.318)
+    assert planned_detect(same.record, 1.0001) == 1.001
 
 
 def test_gates_take_the_mean_and_covariance_of_members_repeats_and_rows():

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import consistency as cs
-from consistency.diagnostics import Errors, InnovationRecord, Origin, Record, Runs, Truth
+from consistency.diagnostics import Bound, BoundErrors, Errors, InnovationRecord, Origin, Record, Runs, Truth
 from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.diagnostics.record import arrays_of
 from consistency.referee.types import Failure
@@ -21,26 +21,32 @@ def numbered(*tail):
     return np.broadcast_to(rows, (*SHAPE, *tail)).copy()
 
 
+def all_errors():
+    bounded = BoundErrors((Bound("bound_x", ("x",), 0.95), Bound("bound_y", ("y",), 0.95)), numbered(2), numbered(2))
+    return Errors(numbered(2), numbered(2, 2), numbered(), 2, ("x", "y"), bounded=bounded)
+
+
 def full(name="f"):
     """A record with each array that it can have."""
     return Record(
         name,
-        Errors(numbered(2), numbered(2, 2), numbered(), 2, ("x", "y"), bound_ratios=numbered(2), regions=numbered(2)),
+        all_errors(),
         InnovationRecord(numbered(), numbered(), numbered(3), numbered(3, 3)),
         Runs(np.arange(10, 15), times=numbered(), by=numbered()),
         (Failure(name, 11, 2, "broke"), Failure(name, 14, 3, "hung")),
         Truth(numbered(2, 2)),
         groups=Groups("speed", ("low",), numbered().astype(int), None),
         origin=Origin(path=numbered(2, 2)),
-        world=Errors(numbered(2), numbered(2, 2), numbered(), bound_ratios=numbered(2), regions=numbered(2)),
+        world=all_errors(),
     )
 
 
 def test_the_record_has_each_array_that_it_can_have():
     record = full()
-    for part in ("errors", "innovations", "runs", "truth", "origin", "world"):
-        value = getattr(record, part)
-        arrays = {field.name for field in fields(value) if isinstance(getattr(value, field.name), np.ndarray)} - {"t"}
+    parts = ("innovations", "runs", "truth", "origin")
+    for value in (record.errors, record.errors.bounded, record.world, *(getattr(record, part) for part in parts)):
+        of_runs = (np.ndarray, BoundErrors)
+        arrays = {field.name for field in fields(value) if isinstance(getattr(value, field.name), of_runs)} - {"t"}
         assert arrays == set(value.OF_RUNS)
         assert {field.name for field in fields(value) if "Array" in str(field.type)} - {"t"} <= arrays | {"numbers"}
 
@@ -52,17 +58,17 @@ def test_some_runs_have_the_rows_of_every_array():
         assert some.run_numbers.tolist() == [11, 13]
         assert [failure.run for failure in some.failures] == [11]
         assert_array_equal(some.groups.index[:, 0], [1, 3])
-        arrays = arrays_of(some) | {f"world.{name}": getattr(some.world, name) for name in Errors.OF_RUNS}
-        assert len(arrays) == 19
+        arrays = arrays_of(some) | {f"world {name}": of for name, of in arrays_of(some.in_world).items()}
+        assert len(arrays) == 2 * len(arrays_of(some)) == 28
         for name, array in arrays.items():
-            if name != "runs.numbers":
+            if "numbers" not in name:
                 assert_array_equal(array.reshape(2, -1)[:, 0], [1, 3], name)
     assert record.first_runs(12).run_numbers.tolist() == [10, 11]
 
 
 def test_independent_windows_become_runs_of_a_step():
     record = full()
-    for values in (record.errors.nees, record.errors.bound_ratios, record.innovations.nis):
+    for values in (record.errors.nees, record.errors.bounded.ratios, record.innovations.nis):
         values[2] = np.nan
     record = replace(record, runs=replace(record.runs, independent=True))
     runs = record.as_runs

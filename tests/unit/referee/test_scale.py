@@ -6,11 +6,11 @@ limits at 1e-5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from draws import autoregression, independent, verdict_on
+from draws import autoregression
 from records import changed
 from scipy import optimize, special, stats
 
@@ -74,15 +74,11 @@ def gamma_shape(means):
     return float(best.x), float(1.0 / np.sqrt((curve[0] - 2.0 * curve[1] + curve[2]) / h**2))
 
 
-@dataclass(frozen=True)
-class Oracle:
+class Oracle(NamedTuple):
     nu: float
     spread: float
-    by_spread: float  # log nu, one standard error to the safe side, at a mean of 1
-    by_likelihood: float
-    shift: float  # to the mean of 1, before the limit at 0
-    clipped: bool  # the mean is farther from 1 than chance carries it
-    floored: bool  # the variance is below 2 / N
+    by_spread: float = 0.0  # log nu, one standard error to the safe side, at a mean of 1
+    by_likelihood: float = 0.0
 
 
 def at_most_skewness(log_nu, mean, dof):
@@ -100,10 +96,8 @@ def oracle(means, dof, steps, gaussian=True):
     left_out, log_mean = [log_nu_of_spread(m) for m in without], [float(np.log(m.mean())) for m in without]
     of_mean, both = covariance_of_left_out(log_mean, log_mean), covariance_of_left_out(left_out, log_mean)
     slope, reach = both / of_mean, 4.0 * np.sqrt(of_mean)
-    distance = float(np.log(means.mean()))
-    shift = -slope * min(max(distance, -reach), reach)
-    unfloored = covariance_of_left_out(left_out, left_out) - slope * both
-    variance = max(unfloored, 2.0 / N)
+    shift = -slope * min(max(float(np.log(means.mean())), -reach), reach)
+    variance = max(covariance_of_left_out(left_out, left_out) - slope * both, 2.0 / N)
     cv2 = means.var(ddof=1) / means.mean() ** 2
     at_one = log_nu_of_spread(means) - np.log1p(cv2 / N) + min(shift, 0.0)
     by_spread = at_most_skewness(at_one, float(means.mean()), dof) - np.sqrt(variance)
@@ -111,7 +105,7 @@ def oracle(means, dof, steps, gaussian=True):
     by_likelihood = np.log(2.0) + log_a - error
     nu = min(np.exp(min(by_spread, by_likelihood)), dof * steps)
     nu, spread = (dof, np.inf) if gaussian and nu <= dof else (nu, 2.0 / variance)
-    return Oracle(nu, spread, by_spread, by_likelihood, shift, abs(distance) > reach, unfloored < 2.0 / N)
+    return Oracle(nu, spread, by_spread, by_likelihood)
 
 
 def tails(ratio, k, spread):
@@ -143,6 +137,7 @@ def cases():
         "one step": (gamma_means(rng, 30, 2.0), 2, 1),
         "small values": (np.concatenate([gamma_means(rng, 40, 40.0), [0.002, 0.01]]), 1, 100),
         "uniform": (rng.uniform(0.2, 1.8, 70), 1, 100),
+        "one degree, too small": (gamma_means(rng, 40, 30.0, 0.8), 1, 2000),
     }
     return found
 
@@ -156,7 +151,7 @@ def test_effective_dof_and_p_values(name, gaussian):
     means, dof, steps = CASES[name]
     test, expected = scale_test(means, dof, steps, gaussian), oracle(means, dof, steps, gaussian)
     if steps == 1 and gaussian:
-        expected = Oracle(dof, np.inf, 0.0, 0.0, 0.0, False, False)
+        expected = Oracle(dof, np.inf)
     assert test.runs == len(means)
     assert test.ratio == pytest.approx(means.mean(), rel=1e-12)
     assert test.effective_dof == pytest.approx(expected.nu, rel=2e-6)
@@ -165,22 +160,6 @@ def test_effective_dof_and_p_values(name, gaussian):
     assert test.above == pytest.approx(above, rel=1e-6, abs=1e-300)
     assert test.below == pytest.approx(below, rel=1e-6, abs=1e-300)
     assert test.p_value == pytest.approx(min(1.0, 2.0 * min(above, below)), rel=1e-6)
-
-
-def test_the_cases_reach_every_branch():
-    """Otherwise a fault in one of them would not be seen above."""
-    all_ = {name: oracle(*case) for name, case in CASES.items()}
-    free = {name: o for name, o in all_.items() if np.isfinite(o.spread)}
-    several = {name: o for name, o in free.items() if o.nu < CASES[name][1] * CASES[name][2]}
-    assert any(o.by_spread < o.by_likelihood - 0.01 for o in several.values())
-    assert any(o.by_likelihood < o.by_spread - 0.01 for o in several.values())
-    first = {name: o for name, o in several.items() if o.by_spread < o.by_likelihood}
-    assert any(o.shift < -0.01 and not o.clipped for o in first.values())
-    assert any(o.shift < -0.01 and o.clipped for o in first.values())
-    assert any(o.shift > 0.01 for o in first.values())
-    assert any(o.floored for o in several.values())
-    assert any(not o.floored for o in several.values())
-    assert len(several) < len(free) < len(all_)  # limited above and below
 
 
 @pytest.mark.parametrize("runs", [1, 2, 19])
@@ -199,17 +178,6 @@ def test_a_run_without_any_error_leaves_the_worst_case():
     assert scale_test(means, 2, 100).effective_dof == 2.0
 
 
-def test_a_right_filter_has_p_values_near_uniform_at_full_dependence():
-    """1,000 draws at 2.5 %, with 19 runs (exact) and 21 and 60 (estimated, nu at its lower end more often than not)."""
-    rng = np.random.default_rng(2)
-    draws, level = 1000, 0.025
-    for runs, n in ((19, 1), (21, 1), (60, 3)):
-        p = np.array([scale_test(rng.chisquare(n, runs) / n, n, 100).p_value for _ in range(draws)])
-        count = int((p <= level).sum())
-        assert count <= stats.binom.isf(SURE, draws, level)
-        assert count >= (stats.binom.ppf(SURE, draws, level) if runs < 20 else 1)
-
-
 def test_effective_dof_of_known_worlds():
     """(tr C)^2 / tr C^2, from below: C_kl = .9^|k - l| in each of 3 components; 2,000 runs."""
     rng = np.random.default_rng(5)
@@ -218,18 +186,6 @@ def test_effective_dof_of_known_worlds():
     exact = n * T**2 / np.square(C).sum()
     nees = np.square(autoregression(rng, 2000, T, n, 0.9)).sum(axis=-1)
     assert 0.8 * exact < mean_test(nees, n).effective_dof < exact * 1.05
-
-
-def test_heavy_tails_may_have_less_than_one_step():
-    rng = np.random.default_rng(6)
-    means = np.exp(1.2 * rng.standard_normal(100))
-    assert scale_test(means, 3, 50).effective_dof == 3.0
-    test = scale_test(means, 3, 50, gaussian=False)
-    assert test.effective_dof < 2.0
-    assert np.isfinite(test.spread)
-    single = scale_test(means, 3, 1, gaussian=False)  # one step may have heavy tails too
-    assert single.effective_dof == pytest.approx(test.effective_dof)
-    assert scale_test(means, 3, 1).effective_dof == 3.0
 
 
 def test_nothing_to_judge():
@@ -413,15 +369,6 @@ def test_level_is_one_less_the_power():
     assert not equivalence(means, 3, 50, Settings(power=1 - 0.99 * at_stake)).shown
 
 
-@pytest.mark.parametrize("ratio", [1.5, 1 / 1.5])
-@pytest.mark.parametrize("runs", [12, 40])
-def test_a_ratio_at_the_end_is_seldom_called_equivalent(ratio, runs):
-    """Fully dependent, 500 draws at 5 % (Student's t leaves up to .7 % more from 20 runs on)."""
-    rng = np.random.default_rng(24)
-    shown = sum(equivalence(gamma_means(rng, runs, 3.0, ratio), 3, 50, Settings()).shown for _ in range(500))
-    assert shown <= stats.binom.isf(SURE, 500, 0.057)
-
-
 def test_a_mean_of_unlike_runs_at_the_end_is_seldom_called_equivalent():
     """A tenth of the runs x6, the others right, one error in all steps: 300 draws of 102 runs at 5 %."""
     rng = np.random.default_rng(29)
@@ -518,14 +465,6 @@ def test_of_innovations():
 # --- in a verdict ---------------------------------------------------------------------------------------
 
 
-def test_a_single_honest_log_is_undecided():
-    rng = np.random.default_rng(33)
-    verdict = verdict_on(independent(rng, 1, 300, 3), false_alarm=SURE)
-    assert verdict.status == "undecided"
-    assert verdict.faults == ()
-    assert "1 run does not show" in verdict.reasons[0]
-
-
 def test_innovations_of_nearly_the_stated_size_are_tolerated():
     """4 % too small in 40,000 innovations is found, shown to lie within 1.1 and not within 1.02; no chance in it."""
     nis = 1.04 * stats.chi2.ppf((np.random.default_rng(0).permutation(40_000) + 0.5) / 40_000, 2).reshape(400, 100)
@@ -597,6 +536,7 @@ def test_the_scale_of_the_pilot_does_not_matter():
         ({"means": np.ones(19)}, "a pilot needs at least 20 runs, got 19"),
         ({"detect": 1.0}, "ratio must be positive and not 1"),
         ({"detect": -2.0}, "ratio must be positive"),
+        ({"detect": np.inf}, "ratio must be positive"),
         ({"detect": 1.000001}, "more than"),
         ({"false_alarm": 0.0}, "false_alarm must lie between"),
         ({"power": 1.0}, "power must lie between"),
@@ -614,10 +554,3 @@ def test_power_of_fractional_degrees_of_freedom():
     assert low < middle < high
     assert required_runs(8.0, 1.2) < required_runs(7.5, 1.2) < required_runs(7.0, 1.2)
     assert middle == pytest.approx(chi_square_power(50 * 7.5, 1.2, 0.025))
-
-
-def test_one_degree_of_freedom_needs_no_bound():
-    means = gamma_means(np.random.default_rng(8), 40, 30.0, 0.8)
-    test = scale_test(means, 1, 2000)
-    assert test.effective_dof == pytest.approx(oracle(means, 1, 2000).nu, rel=2e-6)
-    assert test.effective_dof > 1.0

@@ -139,12 +139,20 @@ def test_without_bounds_there_is_no_figure_of_them():
     assert bound_figures(cs.judge(errors, np.ones((20, 5, 1, 1)))) == ()
 
 
+def test_bounds_of_a_gaussian_are_drawn_as_covariances():
+    errors = np.random.default_rng(8).standard_normal((30, 5, 2))
+    verdict = cs.judge(errors, bounds=np.full(errors.shape, 1.96), level=0.95, gaussian=True)
+    figures = {figure.title: figure for figure in record_figures(verdict.record, verdict)}
+    assert "Errors over their bounds" not in figures
+    assert drawn(figures["Errors and stated bounds"].drawings[0]).axes
+
+
 def test_errors_over_bounds_are_those_of_the_record():
     record, verdict = bounded()
     figure = next(f for f in record_figures(record, verdict) if f.title == "Errors over their bounds")
     for number, axes in enumerate(drawn(figure.drawings[0]).axes):
         shown = next(line for line in axes.lines if line.get_label() == "run 0")
-        assert_allclose(shown.get_ydata(), record.errors.bound_ratios[0, :, number])
+        assert_allclose(shown.get_ydata(), record.errors.bounded.ratios[0, :, number])
         (span,) = (patch for patch in axes.patches if patch.get_label() == "inside the bound")
         assert (span.get_y(), span.get_y() + span.get_height()) == (-1.0, 1.0)
 

@@ -43,16 +43,10 @@ def archive(tmp_path, errors):
 # --- what is asked ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "given, size, unit", [("20", 20, "step"), (20, 20, "step"), ("2s", 2, "s"), (" 0.5 s", 0.5, "s")]
-)
-def test_steps_or_seconds(given, size, unit):
-    assert skip_of(given) == Skip(size, unit)
-
-
-@pytest.mark.parametrize("given", [None, 0, "0", "0s"])
-def test_nothing_is_left_out(given):
-    assert skip_of(given) is None
+def test_steps_or_seconds_or_nothing():
+    of = {"20": Skip(20), 20: Skip(20), "2s": Skip(2, "s"), " 0.5 s": Skip(0.5, "s")}
+    assert {given: skip_of(given) for given in of} == of
+    assert [skip_of(given) for given in (None, 0, "0", "0s")] == [None] * 4
 
 
 @pytest.mark.parametrize("given", [-1, "2.5", 2.5, True, "x", "2m", "s", ""])
@@ -95,15 +89,6 @@ def test_steps_keep_their_numbers(errors):
     with pytest.raises(ConsistencyError, match="without the first 6 steps of each run") as fault:
         assert_consistent(errors, np.array(identities(errors)), skip=FIRST, false_alarm=0.01)
     assert fault.value.verdict.first_step == 23
-
-
-@pytest.mark.parametrize("given", ["2.5s", "5"])
-def test_files_by_seconds_or_steps(given, archive):
-    """Steps are half a second apart."""
-    verdict = cs.judge(cs.read(archive), skip=given)
-    assert verdict.statistics["skipped_steps"] == 5
-    assert np.isnan(verdict.statistics["anees"][:5]).all()
-    assert np.isfinite(verdict.statistics["anees"][5:]).all()
 
 
 def test_tables_have_times_of_each_run(tmp_path):

@@ -51,12 +51,9 @@ def errors_of_truth(rng, kind, runs, steps):
     return v * rng.choice([-1.0, 1.0], (runs, 1, 1)) if kind == "signs" else v
 
 
-def record(
-    rng, kind, s, ratio = 1.0, errors = None, runs = RUNS,
-    steps = STEPS, shared = False,
-):  # fmt: skip
-    """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s."""
-    of_truth = truth_of_share(s)
+def record(rng, kind, s, ratio=1.0, errors=None, runs=RUNS, steps=STEPS, shared=False):
+    """Errors of a filter whose covariance is wrong by ``ratio``, against a truth of the share s; of a seed or draws."""
+    rng, of_truth = np.random.default_rng(rng), truth_of_share(s)
     e = np.sqrt(ratio) * autoregression(rng, runs, steps, N, 0.5) @ np.linalg.cholesky(P).T
     d = e + errors_of_truth(rng, kind, runs, steps) @ np.linalg.cholesky(of_truth).T
     shape = (runs, steps, N, N)
@@ -83,19 +80,17 @@ def test_a_right_filter_is_rarely_at_fault(kind, errors):
 
 def test_a_common_error_of_the_truth_is_a_bias_only_if_it_is_not_declared_otherwise():
     """The error that all runs share has s = .3: an honest filter is biased if the truth is said to be independent."""
-    rng = np.random.default_rng(5)
-    one = record(rng, "common", 0.3, errors="independent")
+    one = record(5, "common", 0.3, errors="independent")
     wrong = judge(make_record("est", one.errors.error + 1.5, one.errors.covariance,
                            truth_covariance=one.truth.covariance,
                            truth_errors="independent"))  # fmt: skip
     assert "bias" in wrong.faults
-    assert not judge(record(np.random.default_rng(5), "common", 0.3, errors="common")).faults
+    assert not judge(record(5, "common", 0.3, errors="common")).faults
 
 
 @pytest.mark.parametrize("errors", [None, "common"])
 def test_a_bias_beyond_the_truth_is_found(errors):
-    rng = np.random.default_rng(8)
-    one = record(rng, "common", 0.2, errors=errors)
+    one = record(8, "common", 0.2, errors=errors)
     far = 6.0 * np.sqrt(np.diag(truth_of_share(0.2)))
     v = judge(make_record("est", one.errors.error + far, one.errors.covariance, axes=one.errors.axes,
                        truth_covariance=one.truth.covariance,
@@ -118,8 +113,7 @@ def test_the_rows_of_the_calibration(monkeypatch):
 
 def test_the_ratio_is_that_of_the_estimate():
     """A P wrong by 2 at s = .5 shows as 1.5 in the sum."""
-    rng = np.random.default_rng(3)
-    one = record(rng, "white", 0.499, 2.0, "independent", runs=2000, steps=1)
+    one = record(3, "white", 0.499, 2.0, "independent", runs=2000, steps=1)
     v = judge(one)
     assert v.scale.mean_anees / N == pytest.approx(1.5, abs=0.06)
     assert v.scale.inflation.value == pytest.approx(2.0, abs=0.12)
@@ -131,7 +125,7 @@ def test_the_ratio_is_that_of_the_estimate():
 
 
 def test_a_share_of_an_axis_is_of_that_axis():
-    one = record(np.random.default_rng(3), "white", 0.2, 1.0, "independent")
+    one = record(3, "white", 0.2, 1.0, "independent")
     truth = uncertain_truth(one)
     T = truth_of_share(0.2)
     assert truth.share("y") == pytest.approx(T[1, 1] / (P + T)[1, 1], rel=1e-9)
@@ -140,25 +134,23 @@ def test_a_share_of_an_axis_is_of_that_axis():
 
 def test_consistent_needs_the_interval_of_the_estimate():
     """At s = .45 the sum lies in [1 / 1.5, 1.5] where P is off by x1.7."""
-    v = judge(record(np.random.default_rng(1), "white", 0.45, 1.0, "independent", runs=30, steps=1))
-    plain = judge(make_record("est", *_sum(record(np.random.default_rng(1), "white", 0.45, 1.0, runs=30, steps=1))))
+    v = judge(record(1, "white", 0.45, 1.0, "independent", runs=30, steps=1))
+    plain = judge(make_record("est", *_sum(record(1, "white", 0.45, 1.0, runs=30, steps=1))))
     assert v.equivalence.p_value > plain.equivalence.p_value
-    sure = judge(record(np.random.default_rng(1), "white", 0.2, 1.0, "independent", runs=200))
+    sure = judge(record(1, "white", 0.2, 1.0, "independent", runs=200))
     assert sure.status == "consistent"
 
 
 @pytest.mark.parametrize("errors", [None, "independent", "common"])
 def test_the_interval_of_the_estimate_shows_what_the_tests_show(errors):
-    one = record(np.random.default_rng(1), "white", 0.2, 1.0, errors, runs=200)
+    one = record(1, "white", 0.2, 1.0, errors, runs=200)
     shown = judge(one).equivalence
     low, high = shown.interval
     assert low < high
     assert shown.shown == (low > 1.0 / shown.factor and high < shown.factor)
     for detect, inside in ((max(high, 1.0 / low) * 1.001, True), (max(high, 1.0 / low) * 0.999, False)):
         assert judge(one, Settings(detect=detect)).equivalence.shown == inside
-    assert (
-        judge(record(np.random.default_rng(1), "white", 0.2, 1.0, None, shared=True)).equivalence.interval[1] == np.inf
-    )
+    assert judge(record(1, "white", 0.2, 1.0, None, shared=True)).equivalence.interval[1] == np.inf
 
 
 def _sum(one):
@@ -168,7 +160,7 @@ def _sum(one):
 
 def test_more_than_half_is_undecided():
     for errors in (None, "independent", "per-run"):
-        v = judge(record(np.random.default_rng(2), "white", 0.6, 4.0, errors))
+        v = judge(record(2, "white", 0.6, 4.0, errors))
         assert v.status == "undecided"
         assert "its covariance is 60 % of both, and at most 50 % can be judged" in v.reasons[0]
         assert "if they are" not in v.reasons[0]
@@ -176,31 +168,31 @@ def test_more_than_half_is_undecided():
 
 
 def test_a_filter_that_has_fused_the_truth_is_never_too_large():
-    v = judge(record(np.random.default_rng(2), "white", 0.2, 0.2, "independent", shared=True))
+    v = judge(record(2, "white", 0.2, 0.2, "independent", shared=True))
     assert v.status == "undecided"
     assert "--truth-shared" in " ".join(v.reasons)
-    far = judge(record(np.random.default_rng(2), "white", 0.2, 8.0, "independent", shared=True))
+    far = judge(record(2, "white", 0.2, 8.0, "independent", shared=True))
     assert far.status == "overconfident"
 
 
 def test_words_name_the_share_and_the_option():
-    v = judge(record(np.random.default_rng(2), "white", 0.2))
+    v = judge(record(2, "white", 0.2))
     assert any("20 % of the sum of both (x " in line and "--truth-errors" in line for line in v.reasons)
-    declared = judge(record(np.random.default_rng(2), "white", 0.2, errors="per-run"))
+    declared = judge(record(2, "white", 0.2, errors="per-run"))
     assert any("declared per-run" in line for line in declared.reasons)
-    exact = judge(make_record("est", *_sum(record(np.random.default_rng(2), "white", 0.2))))
+    exact = judge(make_record("est", *_sum(record(2, "white", 0.2))))
     assert not any("truth" in line for line in exact.reasons)
 
 
 def test_json_gains_keys_only():
-    one = record(np.random.default_rng(2), "white", 0.2, errors="per-run")
+    one = record(2, "white", 0.2, errors="per-run")
     new, old = judge(one).statistics, judge(make_record("est", *_sum(one), axes=one.errors.axes)).statistics
     assert set(new) - set(old) == {"truth_share", "truth_share_of_axes", "truth_errors", "truth_shared"}
     assert not set(old) - set(new)
 
 
 def test_pictures_are_of_both_covariances():
-    one = record(np.random.default_rng(2), "white", 0.2, errors="independent")
+    one = record(2, "white", 0.2, errors="independent")
     v = judge(one)
     drawn = of_both(one)
     assert_allclose(drawn.errors.nees.mean(axis=0), v.scale.anees)
@@ -245,15 +237,15 @@ def test_the_weights_of_the_bound_by_hand():
 
 
 def test_common_to_a_single_run_is_bounded():
-    truth = uncertain_truth(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1))
+    truth = uncertain_truth(record(2, "common", 0.2, errors="common", runs=1))
     assert truth.bounded
-    assert judge(record(np.random.default_rng(2), "common", 0.2, errors="common", runs=1)).status == "undecided"
+    assert judge(record(2, "common", 0.2, errors="common", runs=1)).status == "undecided"
 
 
 def test_only_too_small_is_asked_where_conservative_is_allowed():
     settings = Settings(allow="conservative")
-    assert not judge(record(np.random.default_rng(2), "white", 0.2, 0.2), settings).faults
-    assert judge(record(np.random.default_rng(2), "white", 0.2, 4.0), settings).status == "overconfident"
+    assert not judge(record(2, "white", 0.2, 0.2), settings).faults
+    assert judge(record(2, "white", 0.2, 4.0), settings).status == "overconfident"
 
 
 # --- files -------------------------------------------------------------------------------------------

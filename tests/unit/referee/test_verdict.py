@@ -58,27 +58,26 @@ class Case:
         )  # fmt: skip
 
 
-def make(scale=1.0, bias=0.0, runs=RUNS, steps=STEPS):
-    """Errors of covariance P (and mean ``bias`` standard deviations along x) that a filter calls P / scale.
+def make(scale=1.0):
+    """Errors of covariance P that a filter calls P / scale.
 
     Steps of a run are as dependent as those of a filter: an autoregression with coefficient 0.9.
     """
     rng = np.random.default_rng(5)
-    e = autoregression(rng, runs, steps, 3, 0.9)
+    e = autoregression(rng, RUNS, STEPS, 3, 0.9)
     P = np.array([[0.04, 0.01, 0.001], [0.01, 0.09, -0.002], [0.001, -0.002, 0.003]])
-    error = e @ np.linalg.cholesky(P).T + [bias * 0.2, 0.0, 0.0]
-    covariance = np.broadcast_to(P / scale, (runs, steps, 3, 3)).copy()
-    nis_dof = rng.integers(0, 4, (runs, steps)) * 3
+    error = e @ np.linalg.cholesky(P).T
+    covariance = np.broadcast_to(P / scale, (RUNS, STEPS, 3, 3)).copy()
+    nis_dof = rng.integers(0, 4, (RUNS, STEPS)) * 3
     nis = np.where(nis_dof > 0, scale * rng.chisquare(np.maximum(nis_dof, 1)), np.nan)
     return Case(error, covariance, cs.nees(error, covariance), nis, nis_dof)
 
 
-def broken(case, run, step):
-    """The case with nothing from ``step`` of ``run`` on."""
-    arrays = {name: value.copy() for name, value in vars(case).items()}
-    for name in ("error", "covariance", "nees", "nis"):
-        arrays[name][run, step - 1 :] = np.nan
-    arrays["nis_dof"][run, step - 1 :] = 0
+def broken():
+    """A right case with nothing from where ``BROKE`` on."""
+    arrays = {name: value.copy() for name, value in vars(make()).items()}
+    for name, array in arrays.items():
+        array[BROKE.run, BROKE.step - 1 :] = 0 if name == "nis_dof" else np.nan
     return Case(**arrays)
 
 
@@ -90,18 +89,14 @@ def test_statistics_of_a_calibrated_filter():
     s = case.verdict(false_alarm=0.05).statistics
     assert (s["runs"], s["steps"], s["dof"], s["judged_steps"], s["left_out_steps"]) == (RUNS, STEPS, 3, STEPS, [])
     assert np.allclose(s["anees"], case.nees.mean(axis=0))
-    assert np.array_equal(s["alive"], np.full(STEPS, RUNS))
     assert s["band"][0] == pytest.approx(anees_interval(3, RUNS))
-    assert s["mean_anees"] == pytest.approx(case.nees.mean())
     inside = (s["anees"] >= s["band"][:, 0]) & (s["anees"] <= s["band"][:, 1])
     assert s["share_inside"] == pytest.approx(inside.mean())
     assert s["rmse_position"] != s["rmse_position"]  # the axes have no names
     named = case.verdict(axes=("x", "y", "heading")).statistics
     assert named["rmse_position"] == pytest.approx(np.sqrt(np.mean(np.sum(case.error[..., :2] ** 2, axis=-1))))
     assert named["rmse_heading"] == pytest.approx(np.sqrt(np.mean(case.error[..., 2] ** 2)))
-    assert s["nis_ratio"] == pytest.approx(np.nansum(case.nis) / case.nis_dof.sum())
     assert s["nis_dof"] == case.nis_dof.sum()
-    assert s["ratio"] == pytest.approx(case.nees.mean() / 3)
 
 
 def test_nees_is_worked_out_from_error_and_covariance():
@@ -123,27 +118,11 @@ def test_bonferroni_band_over_all_steps():
     assert np.all(s["simultaneous"][:, 1] > s["band"][:, 1])
 
 
-def test_false_alarms_stay_below_the_stated_rate():
-    """A verdict at 10 % over 200 calibrated filters: more than 40 alarms have probability below 1e-5."""
-    assert stats.binom.sf(40, 200, 0.1) < 1e-5
-    rng = np.random.default_rng(11)
-    P = np.broadcast_to(np.eye(3), (20, 10, 3, 3))
-    alarms = 0
-    for _ in range(200):
-        error = rng.normal(size=(20, 10, 3))
-        nis = np.full((20, 10), np.nan)
-        verdict = judge(
-            "f", error, P, nees=cs.nees(error, P), nis=nis, nis_dof=np.zeros((20, 10), int), false_alarm=0.1
-        )
-        alarms += bool(verdict.faults)
-    assert 0 < alarms <= 40  # none in 200 has probability below 1e-5 if the rate is above 6 %
-
-
 # --- steps and runs left out -----------------------------------------------------------------------
 
 
 def test_a_run_that_fails_midway_counts_only_before():
-    s = broken(make(), run=3, step=12).verdict((BROKE,)).statistics
+    s = broken().verdict((BROKE,)).statistics
     assert np.array_equal(s["alive"], [RUNS] * 11 + [RUNS - 1] * (STEPS - 11))
     assert s["left_out_steps"] == []
     # fewer runs, wider band
@@ -170,7 +149,7 @@ def test_without_truth_the_nis_is_judged(scale, status):
 
 
 def test_without_truth_a_failed_run_counts_too():
-    verdict = blind(broken(make(), 3, 12), failures=(BROKE,))
+    verdict = blind(broken(), failures=(BROKE,))
     assert verdict.status == "failed"
     assert verdict.reasons[0] == "failed: 1 of 50 runs failed, first run 3 in step 12: LinAlgError: singular"
 

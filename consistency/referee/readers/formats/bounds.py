@@ -369,8 +369,8 @@ def judged_bounds(record: Record, e: Estimator, level_text: str) -> Record:
         places = {list(e.error.axes).index(axis): i for i, axis in enumerate(record.errors.axes)}
         parts = tuple(tuple(places[i] for i in index) for index in stated.places)
         note = f"{e.said}: bounds are read as those of a Gaussian at --level {level_text}"
-        errors = replace(record.errors, parts=parts if len(parts) > 1 else ())
+        errors = replace(record.errors, parts=parts if len(parts) > 1 else (), bounded=None)
         return replace(record, errors=errors).with_notes(note)
     failures = tuple(replace(f, reason=f.reason.replace("covariance", "bound")) for f in record.failures)
-    errors = replace(record.errors, error=None, covariance=None, nees=None, dof=0, bounds=stated.bounds)
+    errors = replace(record.errors, error=None, covariance=None, nees=None, dof=0)
     return replace(record, errors=errors, failures=failures, origin=replace(record.origin, causes=()))

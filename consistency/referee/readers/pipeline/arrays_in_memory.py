@@ -139,7 +139,7 @@ def record_of_arrays(
         record = estimator_of_arrays(Path("arrays"), arrays, reading)
         if isinstance(record, Estimator):
             (record,) = records_of(record, reading)
-        if sigma is not None and not record.errors.bounds:
+        if sigma is not None and not record.errors.bounded:
             record = each_alone(record)
         if reading.statement.ensemble is not None or are_repeats:
             from consistency.referee.diagnostics.normal_numbers import of_ensemble, of_repeats

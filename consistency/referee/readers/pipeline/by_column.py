@@ -117,9 +117,9 @@ def _some(count: int, parts: int = 1) -> Indices:
 
 def _sizes(record: Record) -> Array | None:
     """Sizes of errors, (runs, steps): the NEES, or what it would be of bounds; None without truth."""
-    if record.errors.bound_ratios is None:
+    if record.errors.bounded is None:
         return record.errors.nees
-    return np.asarray(np.square(record.errors.bound_ratios).sum(axis=-1))
+    return np.asarray(np.square(record.errors.bounded.ratios).sum(axis=-1))
 
 
 def grouped(record: Record, column: Column, options: GroupOptions, option: str = "--by") -> Record:

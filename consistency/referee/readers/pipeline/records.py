@@ -182,6 +182,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     tracks, t, numbering = _in_columns(e, pairs, tracks)
     notes += numbering
     files = {p.source.run: str(p.source.files[0]) for p in runs}
+    bounds = () if e.error.bounds is None else e.error.bounds.bounds
     records = []
     for ending, group in e.error.stated.groups.items():
         part = [i for i in range(len(e.error.axes))[group] if i in judged]
@@ -190,7 +191,9 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
         some = [track.part(part) for track in tracks]
         axes = tuple(e.error.axes[i] for i in part)
         file, rows = str(e.covariances or e.path), bool(r.runs.independent)
-        record = assemble(f"{e.name}{ending}", some, t, axes, file, e.error.convention, notes, independent=rows)
+        record = assemble(
+            f"{e.name}{ending}", some, t, axes, file, e.error.convention, notes, independent=rows, bounds=bounds
+        )
         record = replace(
             record,
             errors=replace(record.errors, assumed=e.error.assumed),

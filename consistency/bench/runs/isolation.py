@@ -209,13 +209,16 @@ class _Worker:
         InputError
             The filter needs what the trial does not have.
         """
-        place = tuple(sys.path), _folder()
+        try:
+            folder = os.getcwd()
+        except FileNotFoundError:
+            folder = os.sep
         try:
             if filter_.pickled not in self._loaded:
                 loading = None if timeout is None else max(timeout, LOADING)
                 reason = "time-out while it was loaded"
                 self._pid = 0
-                task = self._pool.schedule(load, args=(filter_.pickled, *place), timeout=loading)
+                task = self._pool.schedule(load, args=(filter_.pickled, tuple(sys.path), folder), timeout=loading)
                 self._pid = self._result(task)
                 self._loaded.add(filter_.pickled)
             reason = f"time-out after {timeout:g} s" if timeout is not None else ""
@@ -286,13 +289,6 @@ def _isolated(filter_: Filter) -> Isolated:
         ) from None
     file = getattr(sys.modules[type(filter_).__module__], "__file__", None) or ""
     return Isolated(name, error_of(filter_), rejects(filter_), pickled, Path(file).name)
-
-
-def _folder() -> str:
-    try:
-        return os.getcwd()
-    except FileNotFoundError:
-        return os.sep
 
 
 def _show(printed: Connection) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -285,6 +285,12 @@ def write_tables(
     system.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
 
 
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Texts in files of these names."""
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
 def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
     """The manifest with what tables there are; of results also their rows and digests. Logs may be edited."""
     tables = sorted(COLUMNS.keys() & {file.stem for file in new.path.iterdir() if file.suffix in TABLES})
@@ -296,7 +302,6 @@ def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def _content_of(folder: Path, name: str) -> dict[str, Any]:
-
     with (folder / f"{name}.parquet").open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {"rows": require_table(folder, name).metadata.num_rows, "sha256": digest}

@@ -37,6 +37,7 @@ from consistency.bench.store.parquet import (
     stacked_table,
     truth_columns,
     write_tables,
+    write_texts,
 )
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
@@ -209,8 +210,7 @@ def write_log(
     texts = {"sensor.toml": _sensor_file(belief, trials[0].start, view), **files}
 
     def contents(at: Path) -> None:
-        for name, text in texts.items():
-            (at / name).write_text(text, encoding="utf-8")
+        write_texts(at, texts)
         if form == "csv":
             for name, table in tables.items():
                 table.to_csv(at / f"{name}.csv", index=False)

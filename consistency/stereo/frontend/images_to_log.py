@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount, models
-from consistency.bench.store.parquet import write_tables
+from consistency.bench.store.parquet import write_tables, write_texts
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
@@ -216,13 +216,8 @@ def write_frontend_log(
             view = rig.image_size, rig.principal_point
             write_log(out, [trial], belief, None, manifest, overwrite, view, texts)
             return Summary(sequence, motions, plane, (trial, belief), path)
-    write_tables(out, {}, manifest, lambda at: _write_texts(at, texts), overwrite)
+    write_tables(out, {}, manifest, lambda at: write_texts(at, texts), overwrite)
     return Summary(sequence, motions, plane, None, path)
-
-
-def _write_texts(folder: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (folder / name).write_text(text, encoding="utf-8")
 
 
 def trajectory_texts(

@@ -83,14 +83,10 @@ def opening(report: Report) -> tuple[Block, ...]:
     if main is not None:
         (curves,) = anees_curves(main)
         question = Text(QUESTION), replace(curves, title=f"NEES over time at a baseline of {_baseline(main)}", level=2)
-    return *question, _origin(report), _picture(report), _table(report)
-
-
-def _origin(report: Report) -> Text:
-    """When and by which command the numbers were made, in one line."""
-    said = dict(facts(report.manifest))
-    parts = [f"{name.lower()}: {said[name]}" for name in ORIGIN if name in said]
-    return Text(f"{'; '.join(parts)}.", lead="Origin.")
+    stated = dict(facts(report.manifest))
+    origin = [f"{name.lower()}: {stated[name]}" for name in ORIGIN if name in stated]
+    origin_line = Text(f"{'; '.join(origin)}.", lead="Origin.")
+    return *question, origin_line, _picture(report), _table(report)
 
 
 def main_sentence(studies: Sequence[Study]) -> str:

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from consistency.referee.show.blocks import (
     OVER,
     RIGHT,
     UNDER,
-    Block,
     Cell,
     Chapter,
     Column,
@@ -87,6 +86,11 @@ def compose_regime(regime: Regime) -> Document:
     sweep = regime.sweep
     about = Text(how_cells_are_judged(regime), style="note")
     heat = tuple(heat_figure(regime, name) for name in sweep.filters)
+    world = [("World", f"{sweep.base.name}: {sweep.base.summary}")]
+    for axis in sweep.axes:
+        values = ", ".join(map(axis.say, range(len(axis.values))))
+        world.append((f"{axis.table.capitalize()}: {axis.text}", values))
+    world.append(("Seed", str(sweep.seed)))
     sides, along = _sides(regime), list[Chapter]()
     if len(sweep.axes) == len(sides) == 1:  # heat maps of other sweeps show as much
         along = [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
@@ -95,7 +99,7 @@ def compose_regime(regime: Regime) -> Document:
         *along,
         Chapter("ratios", "How wrong the covariance is", "Covariance ratios", heat),
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
-        Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
+        Chapter("provenance", "Provenance", "Provenance", (Facts((*world, *facts(dict(regime.manifest)))),)),
     ]
     words = badges([(name, result.status) for (_, name), result in regime.results.items()])
     return Document(f"Regime map: {sweep.name}", consistent_cells_sentence(regime), tuple(chapters), badges=words)
@@ -182,16 +186,6 @@ def _others(regime: Regime, cell: GridCell) -> str:
         if result.status != "consistent":
             by_status.setdefault(result.status, []).append(name)
     return "; ".join(f"{status}: {', '.join(names)}" for status, names in by_status.items()) or "–"
-
-
-def _provenance(regime: Regime) -> tuple[Block, ...]:
-    sweep = regime.sweep
-    grid_rows = [
-        (f"{axis.table.capitalize()}: {axis.text}", ", ".join(map(axis.say, range(len(axis.values)))))
-        for axis in sweep.axes
-    ]
-    rows = [("World", f"{sweep.base.name}: {sweep.base.summary}"), *grid_rows, ("Seed", str(sweep.seed))]
-    return (Facts((*rows, *facts(dict(regime.manifest)))),)
 
 
 # --- along one axis ---------------------------------------------------------------------------------
@@ -334,7 +328,7 @@ def _draw_tiles(
         axes.add_patch(Rectangle(
             (column - 0.5, row - 0.5), 1, 1, facecolor=face, edgecolor="white", gid=TITLE + words_of(result)
         ))  # fmt: skip
-        in_tile = {"color": ink_on(face), "ha": "center"}
+        in_tile: dict[str, Any] = {"color": ink_on(face), "ha": "center"}
         axes.text(column, row, brief(result.ratio), weight="bold", va="bottom", **in_tile)
         axes.text(column, row - 0.08, WORDS[result.status], fontsize=5.0, va="top", **in_tile)
 

@@ -28,8 +28,8 @@ from consistency.bench.scenario import (
 )
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
 from consistency.bench.store.parquet import (
-    OPTIONAL,
     check_column,
+    column_kinds,
     controls_table,
     observations_table,
     read_parquet,
@@ -91,7 +91,7 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         raise InputError(f"{path}: column '{missing_columns[0]}' is missing; needed: {', '.join(needed_columns)}")
     if repeated_columns := [column for column in column_names if column_names.count(column) > 1]:
         raise InputError(f"{path}: column '{repeated_columns[0]}' is duplicated")
-    column_types = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in column_names}
+    column_types = column_kinds(name, column_names)
     with reading(path, DAMAGED):
         numbers = dict.fromkeys(column_types, pa.float64())
         convert = pa_csv.ConvertOptions(include_columns=list(column_types), column_types=numbers)

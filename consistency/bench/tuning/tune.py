@@ -36,7 +36,7 @@ from consistency.bench.tuning.noise_factor_fit import (
 )
 from consistency.bench.types import Trial
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.number_words import plural, short
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval, Settings
 from consistency.referee.errors import InputError
@@ -190,7 +190,7 @@ def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
         return run_trials(scenario_with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
 
-    runs_text = _runs(runs)
+    runs_text = plural(runs, "run")
     judged_on = f"{runs_text} that the fit has not seen"
     return Parts(scenario, trials, on_fresh, runs_text, judged_on, f"--runs {runs} --seed {verdict_seed}")
 
@@ -200,7 +200,7 @@ def _parts_of_log(log: Log) -> Parts:
     if len(trials) > 1:
         fitted_runs = (len(trials) + 1) // 2
         fit_trials, verdict_trials = trials[:fitted_runs], trials[fitted_runs:]
-        fitted_on, judged_on = f"the first {_runs(fitted_runs)}", f"the other {len(verdict_trials)}"
+        fitted_on, judged_on = f"the first {plural(fitted_runs, 'run')}", f"the other {len(verdict_trials)}"
     else:
         [only_trial] = trials
         if log.belief.sensor.model == "linear":
@@ -217,10 +217,6 @@ def _parts_of_log(log: Log) -> Parts:
         return run_log(replace(log, trials=verdict_trials, belief=belief), [filter_], jobs, timeout)
 
     return Parts(log, fit_trials, on_fresh, fitted_on, judged_on, "")
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 def part_of(trial: Trial, start: int, end: int) -> Trial:

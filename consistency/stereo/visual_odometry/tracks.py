@@ -355,8 +355,11 @@ def screened_log(log: Log, gate: str | Array) -> Log:
         ``gate`` is not one positive number for each value; the sensor is linear.
     """
     values = np.zeros(0)
+    given: Sequence[str] | Array = gate
+    if isinstance(gate, str):
+        given = gate.split(",")
     with suppress(ValueError):
-        values = np.array(gate.split(",") if isinstance(gate, str) else gate, float)
+        values = np.array(given, float)
     size = log.belief.sensor.size
     if values.shape != (size,) or not (np.isfinite(values) & (values > 0)).all():
         example = ",".join(["2", "2", "1"][:size])

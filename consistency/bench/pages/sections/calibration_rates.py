@@ -93,7 +93,8 @@ def calibration(path: Path | None = None) -> Calibration | None:
         return None
     data = json.loads(path.read_text(encoding="utf-8"))
     rows, rates = data["rows"], list[Rate]()
-    found, gates = (np.array([row[key] for row in rows], float) for key in ("found", "gates"))
+    found = np.array([row["found"] for row in rows], float)
+    gates = np.array([row["gates"] for row in rows], float)
     intervals = zip(*binomial_interval(found, gates, CONFIDENCE), strict=True)
     for row, (low, high) in zip(rows, intervals, strict=True):
         rates.append(Rate(

@@ -75,12 +75,15 @@ def anees_of(study: Study) -> Anees | None:
     shared, curves = common({track.name: track.verdict for track in study.tracks}), []
     for track in study.tracks:
         scale, location = track.verdict.scale, track.verdict.location
-        if scale is not None:
-            simultaneous = None if location is None else location.simultaneous
-            own_band = _fewer(track.verdict, shared)
-            curves.append(
-                Curve(track, scale.anees, scale.band, simultaneous, own_band, *_without_far_runs(track, scale))
-            )
+        if scale is None:
+            continue
+        own_band = False
+        if shared is not None and shared.scale is not None:
+            is_same = np.array_equal(scale.band, shared.scale.band, equal_nan=True)
+            own_band = not is_same and (bool(track.verdict.failures) or track.verdict.runs < shared.runs)
+        simultaneous = None if location is None else location.simultaneous
+        others, far = _without_far_runs(track, scale)
+        curves.append(Curve(track, scale.anees, scale.band, simultaneous, own_band, others, far))
     return Anees(study, tuple(curves))
 
 
@@ -100,13 +103,6 @@ def common(verdicts: dict[str, Verdict]) -> Verdict | None:
     judged = [(v, v.scale) for v in verdicts.values() if v.scale is not None and v.scale.judged_steps]
     best = min(judged, key=lambda p: (-p[0].runs, len(p[0].failures), -int(p[1].alive.sum())), default=None)
     return None if best is None else best[0]
-
-
-def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
-    if verdict.scale is None or shared is None or shared.scale is None:
-        return False
-    same = np.array_equal(verdict.scale.band, shared.scale.band, equal_nan=True)
-    return not same and (bool(verdict.failures) or verdict.runs < shared.runs)
 
 
 def anees_curves(study: Study) -> tuple[Figure, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.bench.pages.sections.nees import anees_curves
 from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
-from consistency.referee.diagnostics.number_words import names_in_a_row, short
+from consistency.referee.diagnostics.number_words import is_or_are, names_in_a_row, short
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Interval
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.pages.write_pages import facts
@@ -103,7 +103,7 @@ def main_sentence(studies: Sequence[Study]) -> str:
         size = ""
         if known:
             size = f" (x{short(known[0])})" if len(known) == 1 else f" (by x{short(known[0])} to x{short(known[-1])})"
-        parts.append(f"{names_in_a_row(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
+        parts.append(f"{names_in_a_row(list(ratios))} {is_or_are(len(ratios))} {status}{size}")
     return f"At a baseline of {_baseline(main)}, {'; '.join(parts)}."
 
 

@@ -13,7 +13,7 @@ import consistency as cs
 from consistency.bench.filters.run_filter import step_through
 from consistency.bench.runs.montecarlo import run_log, simulate_log
 from consistency.bench.scenario import models
-from consistency.bench.scenario.effects import EFFECTS, ListedEffect, Observations
+from consistency.bench.scenario.effects import EFFECTS, FieldOfView, ListedEffect, Observations
 from consistency.bench.scenario.toml_tables import Count, Positive, Triple
 from consistency.bench.simulation import World, draw_landmarks, planned_controls, purpose_of
 from consistency.bench.store.parquet import observations_table
@@ -184,6 +184,18 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(small, tilted, 
     assert np.array_equal(trial.landmark, landmark)
     assert np.allclose(trial.z, z, rtol=0, atol=1e-9)
     assert not np.allclose(cs.simulate(scenario, run=2, seed=4).z[:5], z[:5], rtol=0, atol=1e-9)  # negative control
+
+
+@pytest.mark.parametrize("name", ["linear-gaussian", "herath2007-xyz"])
+def test_a_linear_sensor_looks_from_the_planned_path(small, name):
+    world, rng = World(small(name).truth), np.random.default_rng(0)
+    aside = world.reference + np.array([0.0, 0.0, 0.5])
+
+    def seen(path):
+        context = world.context(path)
+        return FieldOfView().apply(context.ideal(), rng, context).landmark
+
+    assert np.array_equal(seen(aside), seen(world.reference)) == (name == "linear-gaussian")
 
 
 def test_an_empty_list_is_no_list(small):

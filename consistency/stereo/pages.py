@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,52 +154,50 @@ def _bias_map(of: Characterisation) -> Figure:
 
 def _distribution(of: Characterisation) -> Figure:
     """Standardised residuals beside the normal distribution, as fig. 5a and 6."""
+
+    def draw() -> Drawing:
+        figure, panels = canvas(1.7, 3, 3)
+        for c, axes in zip(of.coordinates, panels, strict=True):
+            edges = np.linspace(-REACH, REACH, BINS + 1)
+            height, _ = np.histogram(np.clip(c.residuals, -REACH, REACH), edges, density=True)
+            x = np.linspace(-REACH, REACH, 201)
+            axes.stairs(height, edges, fill=True, color=MEASURED.colour, alpha=0.5)
+            axes.plot(x, stats.norm.pdf(x), label="normal", **stroke(NORMAL))
+            if c.tails.weight.low > 0:
+                nu = 1.0 / c.tails.weight.value
+                density = stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05)))
+                axes.plot(x, density, label="Student's", **stroke(STUDENT))
+            axes.set(xlabel="residual / sd", ylabel="density", title=c.name)
+        return add_legend(figure)
+
     caption = (
         "Residuals over their standard deviation (fig. 5a and 6), with the normal density and, where tails are "
         "heavier, Student's of the estimated degrees of freedom."
     )
-    return Figure("Distribution", caption, (partial(_draw_residuals, of),))
-
-
-def _draw_residuals(of: Characterisation) -> Drawing:
-    figure, panels = canvas(1.7, 3, 3)
-    for c, axes in zip(of.coordinates, panels, strict=True):
-        edges = np.linspace(-REACH, REACH, BINS + 1)
-        height, _ = np.histogram(np.clip(c.residuals, -REACH, REACH), edges, density=True)
-        x = np.linspace(-REACH, REACH, 201)
-        axes.stairs(height, edges, fill=True, color=MEASURED.colour, alpha=0.5)
-        axes.plot(x, stats.norm.pdf(x), label="normal", **stroke(NORMAL))
-        if c.tails.weight.low > 0:
-            nu = 1.0 / c.tails.weight.value
-            density = stats.t.pdf(x, nu, scale=np.sqrt(max(1.0 - 2.0 / nu, 0.05)))
-            axes.plot(x, density, label="Student's", **stroke(STUDENT))
-        axes.set(xlabel="residual / sd", ylabel="density", title=c.name)
-    return add_legend(figure)
+    return Figure("Distribution", caption, (draw,))
 
 
 def _correlation(of: Characterisation) -> tuple[Figure, ...]:
     """Autocorrelation along tracks; none where rows have no order in time."""
     if not any(np.isfinite(c.lags).any() for c in of.coordinates) or of.coordinates[0].correlation is None:
         return ()
+    reach = 1.15 * max(np.nanmax(np.abs([c.lags for c in of.coordinates])), 0.1)
+
+    def draw() -> Drawing:
+        figure, panels = canvas(1.5, 3, 3)
+        for c, axes in zip(of.coordinates, panels, strict=True):
+            lags = np.flatnonzero(np.isfinite(c.lags)) + 1
+            values = c.lags[lags - 1]
+            bound = np.nanmax(c.bounds)
+            axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
+            axes.axhline(0.0, **stroke(EXPECTED))
+            axes.vlines(lags, 0.0, values, color=MEASURED.colour, linewidth=MEASURED.width)
+            axes.plot(lags, values, **dots(MEASURED))
+            ticks = lags[:: max(1, len(lags) // 5)]
+            axes.set(xlabel="lag (steps)", ylabel="correlation", title=c.name, ylim=(-reach, reach), xticks=ticks)
+        return figure
+
     caption = (
         "Autocorrelation along tracks, pooled over all; if the noise is white, 95 % of the lags stay in the shading."
     )
-    return (Figure("Autocorrelation", caption, (partial(_draw_lags, of),)),)
-
-
-def _draw_lags(of: Characterisation) -> Drawing:
-    largest = np.nanmax([c.lags for c in of.coordinates])
-    smallest = np.nanmin([c.lags for c in of.coordinates])
-    reach = 1.15 * max(largest, -smallest, 0.1)
-    figure, panels = canvas(1.5, 3, 3)
-    for c, axes in zip(of.coordinates, panels, strict=True):
-        lags = np.flatnonzero(np.isfinite(c.lags)) + 1
-        values = c.lags[lags - 1]
-        bound = np.nanmax(c.bounds)
-        axes.axhspan(-bound, bound, color=BAND, linewidth=0, zorder=0.4)
-        axes.axhline(0.0, **stroke(EXPECTED))
-        axes.vlines(lags, 0.0, values, color=MEASURED.colour, linewidth=MEASURED.width)
-        axes.plot(lags, values, **dots(MEASURED))
-        ticks = lags[:: max(1, len(lags) // 5)]
-        axes.set(xlabel="lag (steps)", ylabel="correlation", title=c.name, ylim=(-reach, reach), xticks=ticks)
-    return figure
+    return (Figure("Autocorrelation", caption, (draw,)),)

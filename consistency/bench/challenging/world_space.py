@@ -273,14 +273,10 @@ def _choice(name: str, base: Value, values: Sequence[Value], unit: str = "") -> 
 # --- from values to keys of a scenario -----------------------------------------------------------------
 
 
-def _sensor_noise(base: Scenario, factor: float) -> Changes:
-    return in_both("sensor.sigma", tuple(factor * sigma for sigma in base.truth.sensor.sigma))
-
-
 # what a value changes, in truth and belief alike; path, lap, density and seed change the landmarks together
 CHANGES: dict[str, Callable[[Scenario, Any], Changes]] = {
     "odometry": odometry_changes,
-    "sensor": _sensor_noise,
+    "sensor": lambda base, factor: in_both("sensor.sigma", tuple(factor * s for s in base.truth.sensor.sigma)),
     "steps": lambda base, steps: {"truth.steps": int(steps)},
     "dt": lambda base, dt: {"truth.dt": dt},
     "tilt": tilt_changes,

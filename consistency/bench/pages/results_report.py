@@ -21,7 +21,7 @@ from consistency.bench.runs.results_to_records import design_of, longest_run, ni
 from consistency.bench.store.results import open_results
 from consistency.bench.types import OURS, outcome
 from consistency.referee.diagnostics.judge_record import judge
-from consistency.referee.diagnostics.number_words import names_in_a_row, plural
+from consistency.referee.diagnostics.number_words import is_or_are, names_in_a_row, plural
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Settings
 from consistency.referee.errors import InputError
 from consistency.referee.pages.verdicts import time_axis_of
@@ -188,7 +188,7 @@ def _status_sentence(status: str, pairs: list[tuple[Track, Study]]) -> str:
     if not names:
         return ""
     if len(names) > LISTED:
-        return f"{len(names)} {'is' if len(names) == 1 else 'are'} {status} ({STATUSES[status]})."
+        return f"{len(names)} {is_or_are(len(names))} {status} ({STATUSES[status]})."
     return f"{status.capitalize()} ({STATUSES[status]}): {names_in_a_row(names)}."
 
 

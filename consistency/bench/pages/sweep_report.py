@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from consistency.referee.show.blocks import (
     OVER,
     RIGHT,
     UNDER,
-    Block,
     Cell,
     Chapter,
     Column,
@@ -87,23 +86,23 @@ def compose_regime(regime: Regime) -> Document:
     sweep = regime.sweep
     about = Text(how_cells_are_judged(regime), style="note")
     heat = tuple(heat_figure(regime, name) for name in sweep.filters)
+    world = [("World", f"{sweep.base.name}: {sweep.base.summary}")]
+    for axis in sweep.axes:
+        values = ", ".join(map(axis.say, range(len(axis.values))))
+        world.append((f"{axis.table.capitalize()}: {axis.text}", values))
+    world.append(("Seed", str(sweep.seed)))
+    sides, along = _sides(regime), list[Chapter]()
+    if len(sweep.axes) == len(sides) == 1:  # heat maps of other sweeps show as much
+        along = [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
     chapters = [
         Chapter("filters", "Filters", "Filters", (_summary(regime), about), sweep.summary),
-        *_regions(regime),
+        *along,
         Chapter("ratios", "How wrong the covariance is", "Covariance ratios", heat),
         Chapter("rigs", "Rig, and the filters to trust", "Rigs", (_rigs(regime),)),
-        Chapter("provenance", "Provenance", "Provenance", _provenance(regime)),
+        Chapter("provenance", "Provenance", "Provenance", (Facts((*world, *facts(dict(regime.manifest)))),)),
     ]
     words = badges([(name, result.status) for (_, name), result in regime.results.items()])
     return Document(f"Regime map: {sweep.name}", consistent_cells_sentence(regime), tuple(chapters), badges=words)
-
-
-def _regions(regime: Regime) -> list[Chapter]:
-    """The chapter of a sweep along one axis of numbers; none for others, whose heat maps show as much."""
-    sides = _sides(regime)
-    if not len(regime.sweep.axes) == len(sides) == 1:
-        return []
-    return [Chapter("regions", "Where each filter is consistent", "Regions", (_along(regime, sides[0]),))]
 
 
 def consistent_cells_sentence(regime: Regime) -> str:
@@ -189,16 +188,6 @@ def _others(regime: Regime, cell: GridCell) -> str:
     return "; ".join(f"{status}: {', '.join(names)}" for status, names in by_status.items()) or "–"
 
 
-def _provenance(regime: Regime) -> tuple[Block, ...]:
-    sweep = regime.sweep
-    grid_rows = [
-        (f"{axis.table.capitalize()}: {axis.text}", ", ".join(map(axis.say, range(len(axis.values)))))
-        for axis in sweep.axes
-    ]
-    rows = [("World", f"{sweep.base.name}: {sweep.base.summary}"), *grid_rows, ("Seed", str(sweep.seed))]
-    return (Facts((*rows, *facts(dict(regime.manifest)))),)
-
-
 # --- along one axis ---------------------------------------------------------------------------------
 
 
@@ -224,7 +213,7 @@ def _along(regime: Regime, side: GridAxis) -> Figure:
         ratios.set_ylabel("true / stated covariance")
         errors.set_ylabel("RMSE (m)")
         for axes in (ratios, errors):
-            _draw_side(axes, "x", side)
+            _draw_values(axes, side)
             log_axis(axes, "y")
         return add_legend(figure)
 
@@ -243,17 +232,17 @@ def _marker(status: str, colour: str) -> Look:
     return replace(look, colour=colour, size=4.5)
 
 
-def _draw_side(axes: Axes, side: str, axis: GridAxis) -> None:
-    """Ticks and range of one axis of numbers."""
+def _draw_values(axes: Axes, axis: GridAxis) -> None:
+    """Ticks and range of an axis of numbers, from the left."""
     first, last = float(axis.values[0]), float(axis.values[-1])
     unit = f" ({axis.unit})" if axis.unit else ""
-    axes.set(**{f"{side}label": axis.short + unit})
+    axes.set(xlabel=axis.short + unit)
     if axis.log:
-        axes.set(**{f"{side}lim": (first / BEYOND, last * BEYOND)})
-        log_axis(axes, side)
+        axes.set(xlim=(first / BEYOND, last * BEYOND))
+        log_axis(axes, "x")
     else:
         room = 0.08 * (last - first)
-        axes.set(**{f"{side}lim": (first - room, last + room), f"{side}ticks": [float(value) for value in axis.values]})
+        axes.set(xlim=(first - room, last + room), xticks=[float(value) for value in axis.values])
 
 
 # --- heat maps ------------------------------------------------------------------------------------
@@ -318,6 +307,8 @@ def _draw_tiles(
     axes: Axes, regime: Regime, name: str, sides: Sequence[GridAxis], at: Sequence[tuple[GridAxis, int]]
 ) -> None:
     """The heat map at one place on each other axis: values from the left, and from below."""
+    from matplotlib.patches import Rectangle
+
     across, places = sides[0], [regime.sweep.axes.index(axis) for axis in sides]
     count = len(across.values)
     axes.grid(visible=False)
@@ -333,24 +324,19 @@ def _draw_tiles(
         say(axes, "no cell is there yet")
     for cell, result in cell_results:
         row = cell.indices[places[1]] if len(places) > 1 else 0
-        _draw_tile(axes, cell.indices[places[0]], row, result)
+        column, face = cell.indices[places[0]], colour_of(result.ratio)
+        axes.add_patch(Rectangle(
+            (column - 0.5, row - 0.5), 1, 1, facecolor=face, edgecolor="white", gid=TITLE + words_of(result)
+        ))  # fmt: skip
+        in_tile: dict[str, Any] = {"color": ink_on(face), "ha": "center"}
+        axes.text(column, row, brief(result.ratio), weight="bold", va="bottom", **in_tile)
+        axes.text(column, row - 0.08, WORDS[result.status], fontsize=5.0, va="top", **in_tile)
 
 
 def results_at(regime: Regime, name: str, at: Sequence[tuple[GridAxis, int]]) -> list[tuple[GridCell, CellResult]]:
     """Cells at one place on each of some axes that have a verdict on the filter."""
     cells = cells_of(regime, at)
     return [(cell, regime.results[cell.number, name]) for cell in cells if (cell.number, name) in regime.results]
-
-
-def _draw_tile(axes: Axes, x: int, y: int, result: CellResult) -> None:
-    from matplotlib.patches import Rectangle
-
-    face = colour_of(result.ratio)
-    axes.add_patch(Rectangle(
-        (x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", gid=TITLE + words_of(result)
-    ))  # fmt: skip
-    axes.text(x, y, brief(result.ratio), color=ink_on(face), weight="bold", ha="center", va="bottom")
-    axes.text(x, y - 0.08, WORDS[result.status], color=ink_on(face), fontsize=5.0, ha="center", va="top")
 
 
 def words_of(result: CellResult) -> str:

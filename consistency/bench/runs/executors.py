@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from consistency.bench.runs.workers import worker_count
@@ -16,7 +16,6 @@ NAMES = ("local", *ENGINES)
 WAIT = 60.0  # s
 
 
-@contextmanager
 def executor_for(
     name: str = "local",
     jobs: int = -1,
@@ -24,8 +23,8 @@ def executor_for(
     slurm: Sequence[str] = (),
     wait: float | None = None,
     out: Path = Path("results"),
-) -> Iterator[Executor | None]:
-    """Yield the executor of a backend, which is shut down at the end; None for threads of this process.
+) -> AbstractContextManager[Executor | None]:
+    """Return the executor of a backend, for a ``with`` that shuts it down; None for threads of this process.
 
     Parameters
     ----------
@@ -40,17 +39,6 @@ def executor_for(
     InputError
         Another name, an option of another backend, or a package that is not installed.
     """
-    executor = _executor(name, jobs, scheduler, slurm, wait, out)
-    if executor is None:
-        yield None
-    else:
-        with executor:
-            yield executor
-
-
-def _executor(
-    name: str, jobs: int, scheduler: str | None, slurm: Sequence[str], wait: float | None, out: Path
-) -> Executor | None:
     if name not in NAMES:
         raise InputError(f"--backend must be one of {', '.join(NAMES)}, got '{name}'")
     for option, owner, is_given in (
@@ -62,7 +50,7 @@ def _executor(
             raise InputError(f"{option} goes with --backend {owner}, not with {name}")
     if name == "local":
         worker_count(jobs)
-        return None
+        return nullcontext()
     try:
         if name == "dask":
             from consistency.bench.runs.dask_executor import DaskExecutor

@@ -145,7 +145,12 @@ class Isolation:
                     code = error.exitcode
             if code not in KILLED or not self._is_open:
                 break
-        return filter_.failed(trial, _reason(code))
+        reason = f"its process ended with exit status {code}"
+        if code is not None and code < 0:
+            from_outside = ", from outside or because memory ran out" if code in KILLED else ""
+            signal_name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+            reason = f"its process was killed by {signal_name}{from_outside}"
+        return filter_.failed(trial, reason)
 
     @contextlib.contextmanager
     def _worker(self) -> Iterator[_Worker]:
@@ -209,13 +214,16 @@ class _Worker:
         InputError
             The filter needs what the trial does not have.
         """
-        place = tuple(sys.path), _folder()
+        try:
+            folder = os.getcwd()
+        except FileNotFoundError:
+            folder = os.sep
         try:
             if filter_.pickled not in self._loaded:
                 loading = None if timeout is None else max(timeout, LOADING)
                 reason = "time-out while it was loaded"
                 self._pid = 0
-                task = self._pool.schedule(load, args=(filter_.pickled, *place), timeout=loading)
+                task = self._pool.schedule(load, args=(filter_.pickled, tuple(sys.path), folder), timeout=loading)
                 self._pid = self._result(task)
                 self._loaded.add(filter_.pickled)
             reason = f"time-out after {timeout:g} s" if timeout is not None else ""
@@ -264,15 +272,6 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def _reason(code: int | None) -> str:
-    """How a process ended."""
-    if code is None or code >= 0:
-        return f"its process ended with exit status {code}"
-    from_outside = ", from outside or because memory ran out" if code in KILLED else ""
-    signal_name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    return f"its process was killed by {signal_name}{from_outside}"
-
-
 def _isolated(filter_: Filter) -> Isolated:
     from joblib.externals.loky.backend.reduction import dumps
 
@@ -286,13 +285,6 @@ def _isolated(filter_: Filter) -> Isolated:
         ) from None
     file = getattr(sys.modules[type(filter_).__module__], "__file__", None) or ""
     return Isolated(name, error_of(filter_), rejects(filter_), pickled, Path(file).name)
-
-
-def _folder() -> str:
-    try:
-        return os.getcwd()
-    except FileNotFoundError:
-        return os.sep
 
 
 def _show(printed: Connection) -> None:
@@ -396,15 +388,11 @@ def _limited(memory: float | None) -> Iterator[None]:
     if memory is None or resource is None:
         yield
         return
+    with open("/proc/self/status", encoding="ascii") as lines:  # what RLIMIT_DATA limits (Linux 4.7 and later)
+        private_bytes = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmData"))
     _, hard_limit = resource.getrlimit(resource.RLIMIT_DATA)
-    resource.setrlimit(resource.RLIMIT_DATA, (_private_bytes() + int(memory * GIB), hard_limit))
+    resource.setrlimit(resource.RLIMIT_DATA, (private_bytes + int(memory * GIB), hard_limit))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, (hard_limit, hard_limit))
-
-
-def _private_bytes() -> int:
-    """Private writable memory of this process, mapped or used: what RLIMIT_DATA limits (Linux 4.7 and later)."""
-    with open("/proc/self/status", encoding="ascii") as lines:
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmData"))

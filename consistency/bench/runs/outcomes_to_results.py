@@ -374,7 +374,11 @@ def _gathered(study: Mapping[str, Any], journal: Journal, new: NewFolder | None,
     sources += [journal.study] if journal.runs else []
     machines: list[dict[str, str]] = []
     for source in sources:
-        _require_same(study, source)
+        for key, what_differs in KEYS.items() if source else ():
+            value_now, value_before = study.get(key), source.get(key, {} if key == "error" else None)
+            # a study with a fixed number of runs has no plan to differ
+            if value_now != value_before and not (key == PLAN and None in (value_now, value_before)):
+                raise InputError(f"the results to resume have another {what_differs}; use the same command as before")
         machines += [machine for machine in source.get("machines", []) if machine not in machines]
     this = this_machine()
     if others := [machine for machine in machines if machine != this]:
@@ -383,11 +387,3 @@ def _gathered(study: Mapping[str, Any], journal: Journal, new: NewFolder | None,
             "the last digits of the others may differ from those of one machine"
         )
     return Gathered(study["filters"], study["error"], journal, new, previous, others)
-
-
-def _require_same(study: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-    """Refuse to continue from runs of something else; a study with a fixed number of runs has no plan to differ."""
-    for key, what_differs in KEYS.items() if before else ():
-        value_now, value_before = study.get(key), before.get(key, {} if key == "error" else None)
-        if value_now != value_before and not (key == PLAN and None in (value_now, value_before)):
-            raise InputError(f"the results to resume have another {what_differs}; use the same command as before")

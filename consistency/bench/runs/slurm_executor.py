@@ -80,12 +80,6 @@ class SlurmExecutor(Executor):
     @cached_property
     def _looks(self) -> threading.Thread:
         """A thread that sends what waits, and looks at the jobs, until the end."""
-        submit = self._submitter()
-        thread = threading.Thread(target=self._look, args=(submit,), daemon=True)
-        thread.start()
-        return thread
-
-    def _submitter(self) -> Any:
         options = {"job_name": "consistency"} | self.options
         cluster, minutes = options.pop("cluster", "slurm"), options.pop("time", MINUTES)
         logging.getLogger("submitit").setLevel(logging.CRITICAL)
@@ -101,7 +95,9 @@ class SlurmExecutor(Executor):
         except (RuntimeError, ValueError, NameError, AssertionError) as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             raise InputError(f"--backend slurm: {one_line(f'{type(error).__name__}: {error}', 400)}") from None
-        return executor
+        thread = threading.Thread(target=self._look, args=(executor,), daemon=True)
+        thread.start()
+        return thread
 
     def _look(self, executor: Any) -> None:
         while not self._is_over.wait(GLANCE):

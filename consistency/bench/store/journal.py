@@ -128,7 +128,12 @@ class Journal:
             column_types, numbers, checksum = row
             if _checksum(run, name, column_types, numbers) != checksum:
                 raise self._damaged(f"run {run}")
-            yield run, _decode(numbers, json.loads(column_types))
+            kinds, columns, offset = json.loads(column_types), dict[str, Array](), 0
+            rows = len(numbers) // sum(np.dtype(kind).itemsize for kind in kinds.values())
+            for column, kind in kinds.items():
+                columns[column] = np.frombuffer(numbers, kind, rows, offset)
+                offset += columns[column].nbytes
+            yield run, columns
 
     def close(self) -> None:
         with self._faults():
@@ -167,17 +172,6 @@ class Journal:
 def _checksum(run: int, name: str, column_types: str, numbers: bytes) -> int:
     """CRC-32 of a part with its key, because a damaged index may lead to the row of another run."""
     return zlib.crc32(numbers, zlib.crc32(f"{run} {name} {column_types}".encode()))
-
-
-def _decode(numbers: bytes, types: Mapping[str, str]) -> Columns:
-    """Return the columns of a part, all of one length."""
-    rows = len(numbers) // sum(np.dtype(kind).itemsize for kind in types.values())
-    columns: dict[str, Array] = {}
-    offset = 0
-    for name, kind in types.items():
-        columns[name] = np.frombuffer(numbers, kind, rows, offset)
-        offset += columns[name].nbytes
-    return columns
 
 
 # --- beside an output folder -----------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,7 +51,7 @@ class Writer:
     """
 
     def __init__(self, path: Path, name: str, columns: Iterable[str] = ()) -> None:
-        kinds = _kinds(name, columns)
+        kinds = column_kinds(name, columns)
         self.optional = set(OPTIONAL.get(name, ()))
         self.schema = pa.schema([(column, TYPES[kind]) for column, kind in kinds.items()])
         # the bytes of similar numbers are alike: apart from each other they take less room, and nothing is lost
@@ -100,7 +100,7 @@ class Writer:
         self._rows -= rows
 
 
-def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
+def column_kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
     """Types of the columns of a table, with those of the optional ones that are among ``columns``."""
     present = set(columns)
     return COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in present}
@@ -108,7 +108,7 @@ def _kinds(name: str, columns: Iterable[str]) -> dict[str, str]:
 
 def write_table(path: Path, name: str, table: pd.DataFrame) -> None:
     """A whole table; estimates and maps in row groups of one filter each."""
-    kinds = _kinds(name, map(str, table))
+    kinds = column_kinds(name, map(str, table))
     table = table[list(kinds)].astype(kinds)
     with Writer(path, name, kinds) as writer:
         if name not in BY_FILTER:
@@ -134,7 +134,7 @@ def read_parquet(folder: Path, name: str) -> pd.DataFrame:
     """
     path = folder / f"{name}.parquet"
     file = require_table(folder, name)
-    dtypes = _kinds(name, file.schema_arrow.names)
+    dtypes = column_kinds(name, file.schema_arrow.names)
     with reading(path):
         read = _plain(file.read(list(dtypes)))
         table = read.to_pandas()
@@ -285,6 +285,12 @@ def write_tables(
     system.write_folder(folder, manifest, contents, overwrite, keep_others, with_tables)
 
 
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Texts in files of these names."""
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
 def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
     """The manifest with what tables there are; of results also their rows and digests. Logs may be edited."""
     tables = sorted(COLUMNS.keys() & {file.stem for file in new.path.iterdir() if file.suffix in TABLES})
@@ -296,7 +302,6 @@ def with_tables(new: NewFolder, manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def _content_of(folder: Path, name: str) -> dict[str, Any]:
-
     with (folder / f"{name}.parquet").open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return {"rows": require_table(folder, name).metadata.num_rows, "sha256": digest}

@@ -28,8 +28,8 @@ from consistency.bench.scenario import (
 )
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
 from consistency.bench.store.parquet import (
-    OPTIONAL,
     check_column,
+    column_kinds,
     controls_table,
     observations_table,
     read_parquet,
@@ -37,6 +37,7 @@ from consistency.bench.store.parquet import (
     stacked_table,
     truth_columns,
     write_tables,
+    write_texts,
 )
 from consistency.bench.types import Trial
 from consistency.referee.column_names import COLUMNS, POSE
@@ -90,7 +91,7 @@ def read_table_file(folder: Path, name: str, also: Sequence[str] = ()) -> pd.Dat
         raise InputError(f"{path}: column '{missing_columns[0]}' is missing; needed: {', '.join(needed_columns)}")
     if repeated_columns := [column for column in column_names if column_names.count(column) > 1]:
         raise InputError(f"{path}: column '{repeated_columns[0]}' is duplicated")
-    column_types = COLUMNS[name] | {key: kind for key, kind in OPTIONAL.get(name, {}).items() if key in column_names}
+    column_types = column_kinds(name, column_names)
     with reading(path, DAMAGED):
         numbers = dict.fromkeys(column_types, pa.float64())
         convert = pa_csv.ConvertOptions(include_columns=list(column_types), column_types=numbers)
@@ -209,8 +210,7 @@ def write_log(
     texts = {"sensor.toml": _sensor_file(belief, trials[0].start, view), **files}
 
     def contents(at: Path) -> None:
-        for name, text in texts.items():
-            (at / name).write_text(text, encoding="utf-8")
+        write_texts(at, texts)
         if form == "csv":
             for name, table in tables.items():
                 table.to_csv(at / f"{name}.csv", index=False)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
@@ -26,7 +26,7 @@ from consistency.bench.runs.montecarlo import run_until_decided
 from consistency.bench.runs.results_to_records import mean_nees_of_runs, record_of
 from consistency.bench.runs.run_outcome import compile_all
 from consistency.bench.runs.workers import worker_count
-from consistency.bench.scenario import Scenario
+from consistency.bench.scenario import Belief, Scenario
 from consistency.bench.simulation import simulate
 from consistency.bench.store.journal import Busy, Journal, Unfinished
 from consistency.bench.store.parquet import write_tables
@@ -92,27 +92,35 @@ def run_sweep(
     ]
     if len(todo) < len(work):
         say(f"{len(work) - len(todo)} of {len(work)} are there already")
+    run = functools.partial(run_cell, jobs=jobs, executor=executor)
     started = time.monotonic()
-    for count, done in enumerate(_in_turn(folder, todo, jobs, executor), 1):
+    for count, done in enumerate(_in_turn(folder, todo, run), 1):
         seconds_left = (time.monotonic() - started) / count * (len(todo) - count)
         say(f"{count} of {len(todo)}: {done.text}: {_outcome_text(folder.result(done))}{_time_left(seconds_left)}")
     return folder
 
 
-def _in_turn(folder: SweepFolder, todo: list[CellWork], jobs: int, executor: Executor | None) -> Iterator[CellWork]:
-    """Do each, and yield it when it is there; what another process is at work on is tried again after the others."""
+def _in_turn(
+    folder: SweepFolder, todo: list[CellWork], run: Callable[[Sweep, Cell, str, Journal], CellOutcome]
+) -> Iterator[CellWork]:
+    """Run each, and yield it when it is there; what another process is at work on is tried again after the others."""
     is_told = False
     while todo:
         busy_cells = []
         for work in todo:
             try:
-                with _system_refusals(folder), folder.at_work(work) as journal:
+                with folder.at_work(work) as journal:
                     if folder.result(work) is None:  # nobody has done it meanwhile
                         begun = time.monotonic()
-                        outcome = run_cell(folder.sweep, work.cell, work.filter, journal, jobs, executor)
+                        outcome = run(folder.sweep, work.cell, work.filter, journal)
                         folder.write(work, outcome, time.monotonic() - begun)
             except Busy:
                 busy_cells.append(work)
+            except OSError as error:
+                raise InputError(
+                    f"--out {folder.path}: {error.strerror or error}; what is finished is there, and the same command "
+                    "continues"
+                ) from error
             else:
                 yield work
         if len(busy_cells) == len(todo):
@@ -121,17 +129,6 @@ def _in_turn(folder: SweepFolder, todo: list[CellWork], jobs: int, executor: Exe
             is_told = True
             time.sleep(PAUSE)
         todo = busy_cells
-
-
-@contextmanager
-def _system_refusals(folder: SweepFolder) -> Iterator[None]:
-    """Say what the system refuses in one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"--out {folder.path}: {error.strerror or error}; what is finished is there, and the same command continues"
-        ) from error
 
 
 def _outcome_text(result: CellResult | None) -> str:
@@ -471,15 +468,14 @@ def cost_of(filter_name: str, reference: str, scenario: Scenario, seed: int) -> 
     """
     filters = [get_filter(name) for name in dict.fromkeys((filter_name, reference))]
     for run in range(TIMED):
-        seconds = _fastest(filters, simulate(scenario, run, seed), scenario)
+        seconds = _fastest(filters, simulate(scenario, run, seed), scenario.belief)
         if np.isfinite(seconds).all():
             return seconds[0] / seconds[-1], 1e6 * seconds[0] / scenario.truth.steps
     return np.nan, np.nan
 
 
-def _fastest(filters: list[Filter], trial: Trial, scenario: Scenario) -> list[float]:
+def _fastest(filters: list[Filter], trial: Trial, belief: Belief) -> list[float]:
     """Seconds that each filter takes at best; infinite where it fails, which is tried where it can do no harm."""
-    belief = scenario.belief
     if not_compiled := [filter_ for filter_ in filters if not isinstance(filter_, Compiled)]:
         with Isolation(not_compiled, belief, PATIENCE) as isolation:
             if any(estimates.failure for estimates in isolation.run(trial)):
@@ -490,17 +486,17 @@ def _fastest(filters: list[Filter], trial: Trial, scenario: Scenario) -> list[fl
     with one_blas_thread(), ThreadPoolExecutor(1) as thread:
         for _ in range(TIMED):
             for i, filter_ in enumerate(filters):
-                seconds = thread.submit(_cpu_time, filter_, trial, scenario).result()
+                seconds = thread.submit(_cpu_time, filter_, trial, belief).result()
                 fastest_seconds[i] = min(fastest_seconds[i], seconds)
             if sum(fastest_seconds) > SLOW:
                 break
     return fastest_seconds
 
 
-def _cpu_time(filter_: Filter, trial: Trial, scenario: Scenario) -> float:
+def _cpu_time(filter_: Filter, trial: Trial, belief: Belief) -> float:
     """Seconds of this thread that a trial takes; infinite where the run fails."""
     started = time.thread_time()
-    estimates = run_filter(filter_, trial, scenario.belief)
+    estimates = run_filter(filter_, trial, belief)
     spent = time.thread_time() - started
     return np.inf if estimates.failure is not None else spent
 

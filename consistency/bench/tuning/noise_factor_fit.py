@@ -340,7 +340,11 @@ class BeliefScorer:
         with one_blas_thread():
             scores = list(self._pool.map(lambda trial: self._score(trial, belief), self.trials))
         self.settings += 1
-        self._tell()
+        now = time.monotonic()
+        if now - self._told >= EVERY:
+            self._told = now
+            where = f"{self.settings} settings on each of {len(self.trials)} runs"
+            say(f"fitting {name_of(self.filter)}: {where}, {now - self.began:.0f} s")
         density = np.zeros((len(scores), max(trial.steps for trial in self.trials)))
         failures = []
         for row, trial, score in zip(density, self.trials, scores, strict=True):
@@ -354,17 +358,6 @@ class BeliefScorer:
     def _score(self, trial: Trial, belief: Belief) -> RunScore:
         [estimates] = self._isolation.run(trial, belief)
         return score_of_run_by_innovations(trial, estimates)
-
-    def _tell(self) -> None:
-        """Print a line of progress, every few seconds."""
-        now = time.monotonic()
-        if now - self._told < EVERY:
-            return
-        self._told = now
-        say(
-            f"fitting {name_of(self.filter)}: {self.settings} settings on each of {len(self.trials)} runs, "
-            f"{now - self.began:.0f} s"
-        )
 
 
 class NoiseGroup(NamedTuple):

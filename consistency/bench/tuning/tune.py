@@ -19,7 +19,7 @@ from consistency.bench.runs.results_to_records import analyse
 from consistency.bench.runs.run_outcome import Simulated
 from consistency.bench.scenario import Belief, Scenario, load_scenario, scenario_text, toml_text
 from consistency.bench.scenario.toml_tables import SIGMA_UNITS
-from consistency.bench.store.parquet import write_tables
+from consistency.bench.store.parquet import write_tables, write_texts
 from consistency.bench.store.recorded_log import Log, sensor_text
 from consistency.bench.store.results import Tables
 from consistency.bench.tuning.noise_factor_fit import (
@@ -36,7 +36,7 @@ from consistency.bench.tuning.noise_factor_fit import (
 )
 from consistency.bench.types import Trial
 from consistency.referee.defaults import CONFIDENCE
-from consistency.referee.diagnostics.number_words import short
+from consistency.referee.diagnostics.number_words import plural, short
 from consistency.referee.diagnostics.verdict import Verdict, plain
 from consistency.referee.diagnostics.verdict_parts import Interval, Settings
 from consistency.referee.errors import InputError
@@ -190,7 +190,7 @@ def _parts_of_scenario(scenario: Scenario, runs: int, seed: int) -> Parts:
     def on_fresh(filter_: Filter, belief: Belief, jobs: int, timeout: float | None) -> Tables:
         return run_trials(scenario_with_belief(scenario, belief), [filter_], runs, verdict_seed, jobs, timeout)
 
-    runs_text = _runs(runs)
+    runs_text = plural(runs, "run")
     judged_on = f"{runs_text} that the fit has not seen"
     return Parts(scenario, trials, on_fresh, runs_text, judged_on, f"--runs {runs} --seed {verdict_seed}")
 
@@ -200,7 +200,7 @@ def _parts_of_log(log: Log) -> Parts:
     if len(trials) > 1:
         fitted_runs = (len(trials) + 1) // 2
         fit_trials, verdict_trials = trials[:fitted_runs], trials[fitted_runs:]
-        fitted_on, judged_on = f"the first {_runs(fitted_runs)}", f"the other {len(verdict_trials)}"
+        fitted_on, judged_on = f"the first {plural(fitted_runs, 'run')}", f"the other {len(verdict_trials)}"
     else:
         [only_trial] = trials
         if log.belief.sensor.model == "linear":
@@ -217,10 +217,6 @@ def _parts_of_log(log: Log) -> Parts:
         return run_log(replace(log, trials=verdict_trials, belief=belief), [filter_], jobs, timeout)
 
     return Parts(log, fit_trials, on_fresh, fitted_on, judged_on, "")
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 def part_of(trial: Trial, start: int, end: int) -> Trial:
@@ -410,47 +406,39 @@ def write(tuning: Tuning, out: Path, overwrite: bool) -> None:
     """Write the files of a fit, with its outcome, as a folder that appears whole."""
     tuning_json = json.dumps(tuning_data(tuning, out), indent=2, allow_nan=False) + "\n"
     texts_by_file = files(tuning) | {"tuning.json": tuning_json}
-
-    def contents(at: Path) -> None:
-        for name, text in texts_by_file.items():
-            (at / name).write_text(text, encoding="utf-8")
-
     world = tuning.parts.world
     origin: dict[str, Any] = {"scenario": world.name}
     if isinstance(world, Log):
         origin = {"log": world.name, "log_sha256": world.sha256}
     manifest = manifest_of(KIND, wall=tuning.seconds, filters=[tuning.filter], **origin)
-    write_tables(out, {}, manifest, contents, overwrite)
+    write_tables(out, {}, manifest, lambda at: write_texts(at, texts_by_file), overwrite)
 
 
 def tuning_data(tuning: Tuning, out: Path | None = None) -> dict[str, Any]:
     """The outcome for programs; numbers that are not finite become null. An open interval has low 0 or high null."""
+    factors = []
+    for factor in tuning.factors:
+        group, interval = factor.group, factor.interval
+        row = {"group": group.name, "channels": list(group.channels), "factor": factor.value}
+        factors.append(row | {"low": interval.low, "high": interval.high, "edge": factor.edge})
+    chosen = {
+        "factors": factors,
+        "sigma": sigma_by_channel(tuning.belief),
+        "settings": tuning.chosen.settings,
+        "verdict": _verdict_data(tuning.verdict),
+    }
     data = {
         "filter": tuning.filter,
         "world": tuning.parts.world.name,
         "fitted_on": tuning.parts.fitted_on,
         "judged_on": tuning.parts.judged_on,
         "before": _verdict_data(tuning.before),
-        "chosen": _setting_data(tuning.chosen),
+        "chosen": chosen,
         "consistent": tuning.consistent,
         "seconds": tuning.seconds,
         "out": None if out is None else str(out),
     }
     return dict(plain(data))
-
-
-def _setting_data(setting: Setting) -> Mapping[str, Any]:
-    factors = []
-    for factor in setting.factors:
-        group, interval = factor.group, factor.interval
-        row = {"group": group.name, "channels": list(group.channels), "factor": factor.value}
-        factors.append(row | {"low": interval.low, "high": interval.high, "edge": factor.edge})
-    return {
-        "factors": factors,
-        "sigma": sigma_by_channel(setting.belief),
-        "settings": setting.settings,
-        "verdict": _verdict_data(setting.verdict),
-    }
 
 
 def _verdict_data(verdict: Verdict) -> Mapping[str, Any]:

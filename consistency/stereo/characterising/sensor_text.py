@@ -179,24 +179,19 @@ def _rounded(values: Iterable[float], digits: int) -> tuple[float, ...]:
 
 def measured_sensor_toml(of: Characterisation, others: Mapping[str, Any] = MappingProxyType({})) -> str:
     """The text of ``sensor.toml``; ``others`` are tables of the log that stay as they are (motion, start, ...)."""
-    comments = ["Measured by 'consistency characterise'.", counted(of) + ".", *sentences(of), *_half_widths(of)]
+    comments = ["Measured by 'consistency characterise'.", counted(of) + ".", *sentences(of)]
+    if of.bias is not None:
+        for k in np.flatnonzero(of.bias.shown):
+            comments.append(
+                f"Half widths of bias_{NAMES[k]}, px; rows are v, columns are u; nan: not known, taken as zero:"
+            )
+            for row in of.bias.half[k].reshape(len(of.bias.grid.v), -1):
+                comments.append("  " + " ".join(f"±{width:.2g}" for width in row))
     tables = sensor_keys(believed_sensor(of))
     for key, value in others.items():
         if value is not None:
             tables[key] = value
     return "".join(f"# {line}\n" for line in comments) + toml_text(tables)
-
-
-def _half_widths(of: Characterisation) -> list[str]:
-    """Half widths of the intervals at the nodes of the bias map, a line for each row of the image."""
-    lines: list[str] = []
-    if of.bias is None:
-        return lines
-    for k in np.flatnonzero(of.bias.shown):
-        lines.append(f"Half widths of bias_{NAMES[k]}, px; rows are v, columns are u; nan: not known, taken as zero:")
-        for row in of.bias.half[k].reshape(len(of.bias.grid.v), -1):
-            lines.append("  " + " ".join(f"±{width:.2g}" for width in row))
-    return lines
 
 
 def as_json(of: Characterisation) -> str:

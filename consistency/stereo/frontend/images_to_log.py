@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from consistency.bench.scenario import Belief, BelievedMotion, BelievedSensor, Mount, models
-from consistency.bench.store.parquet import write_tables
+from consistency.bench.store.parquet import write_tables, write_texts
 from consistency.bench.store.recorded_log import write_log
 from consistency.bench.types import Trial
 from consistency.referee.errors import InputError
@@ -112,15 +112,24 @@ class Summary(NamedTuple):
         if self.log is not None:
             trial, belief = self.log
             u, v, d = belief.sensor.sigma
-            motion = belief.motion
             return [
                 f"log: {trial.n_landmarks} landmarks, {len(trial.z)} observations; sigma u {u:.2f} v {v:.2f} "
-                f"d {d:.2f} px, v {motion.sigma_v:.3g} m/s, omega {motion.sigma_omega:.3g} rad/s",
+                f"d {d:.2f} px, v {belief.motion.sigma_v:.3g} m/s, omega {belief.motion.sigma_omega:.3g} rad/s",
                 "controls come from these images too: a filter that takes both uses the images twice",
                 f"log in {out}; next: consistency run --log {out} --filter ekf-uvd --out RESULTS",
             ]
         if self.plane is None:
-            return _motion_lines(self.motions[0], out)
+            motion = self.motions[0]
+            scale = np.repeat([1e3, 180.0 / np.pi], 3)
+            values = scale * motion.pose.vector
+            sigmas = scale * np.sqrt(np.diagonal(motion.covariance))
+            texts = []
+            for name, value, sigma in zip(AXES, values, sigmas, strict=True):
+                texts.append(f"{name} {value:+.2f} +- {sigma:.2g}")
+            return [
+                f"motion of the left camera: {', '.join(texts[:3])} mm; {', '.join(texts[3:])} deg",
+                f"no log of {FEWEST - 1} pairs; motion in {out}",
+            ]
         return [
             f"no planar log of a camera that is not on a robot in the plane: trajectory and motions are in {out}; "
             "--planar writes the log nevertheless"
@@ -139,17 +148,6 @@ class Summary(NamedTuple):
             f"truth from {self.truth}; next: {judge} --error so3",
             f"or motion by motion, whatever the world: {windows}",
         ]
-
-
-def _motion_lines(motion: RelativeMotion, out: Path) -> list[str]:
-    scale = np.repeat([1e3, 180.0 / np.pi], 3)
-    values = scale * motion.pose.vector
-    sigmas = scale * np.sqrt(np.diagonal(motion.covariance))
-    texts = [f"{name} {value:+.2f} +- {sigma:.2g}" for name, value, sigma in zip(AXES, values, sigmas, strict=True)]
-    return [
-        f"motion of the left camera: {', '.join(texts[:3])} mm; {', '.join(texts[3:])} deg",
-        f"no log of {FEWEST - 1} pairs; motion in {out}",
-    ]
 
 
 def write_frontend_log(
@@ -216,13 +214,8 @@ def write_frontend_log(
             view = rig.image_size, rig.principal_point
             write_log(out, [trial], belief, None, manifest, overwrite, view, texts)
             return Summary(sequence, motions, plane, (trial, belief), path)
-    write_tables(out, {}, manifest, lambda at: _write_texts(at, texts), overwrite)
+    write_tables(out, {}, manifest, lambda at: write_texts(at, texts), overwrite)
     return Summary(sequence, motions, plane, None, path)
-
-
-def _write_texts(folder: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (folder / name).write_text(text, encoding="utf-8")
 
 
 def trajectory_texts(

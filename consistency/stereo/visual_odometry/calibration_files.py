@@ -32,7 +32,11 @@ OPENCV_KEYS = {
     "T": ("T", "translation_coefficients", "translation_vector", "T_stereo"),
 }
 # matrices that the same tools write beside them and nobody needs here
-OTHERS = {"R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P"}
+OTHERS = {
+    "R1", "R2", "P1", "P2", "Q", "E", "F", "essential_matrix", "fundamental_matrix", "LEFT.R", "LEFT.P", "RIGHT.R",
+    "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1", "rectification_matrix_2",
+    "image_size", "imageSize",
+}  # fmt: skip
 NUMBERS = {"K1": 9, "K2": 9, "R": 9, "T": 3}  # of matrices whose size is fixed
 SIZE_KEYS = ("image_width", "image_height")
 EUROC_KEYS = ("T_BS", "intrinsics", "distortion_model", "distortion_coefficients", "resolution")
@@ -44,11 +48,6 @@ DEEPEST = 100  # brackets in brackets
 _STACKED = re.compile(rf"(?:[-?:] ){{{DEEPEST}}}")  # lists in lists on one line
 SIGNATURE = "%YAML"  # how a file of FileStorage begins: %YAML:1.0 up to OpenCV 4, %YAML 1.2 since
 MATRIX = {"rows", "cols", "dt", "data"}  # keys of a matrix in it
-
-OTHERS |= {"RIGHT.R", "RIGHT.P", "projection_matrix_1", "projection_matrix_2", "rectification_matrix_1"}
-
-
-OTHERS |= {"rectification_matrix_2", "image_size", "imageSize"}
 
 
 def read_calibration(

@@ -9,6 +9,7 @@ filter is used.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -353,7 +354,12 @@ def screened_log(log: Log, gate: str | Array) -> Log:
     InputError
         ``gate`` is not one positive number for each value; the sensor is linear.
     """
-    values = _numbers(gate)
+    values = np.zeros(0)
+    given: Sequence[str] | Array = gate
+    if isinstance(gate, str):
+        given = gate.split(",")
+    with suppress(ValueError):
+        values = np.array(given, float)
     size = log.belief.sensor.size
     if values.shape != (size,) or not (np.isfinite(values) & (values > 0)).all():
         example = ",".join(["2", "2", "1"][:size])
@@ -386,12 +392,3 @@ def screening_line(log: Log) -> str:
         f"screen: {found['broken']} of {found['judged']} observations that follow another of their landmark leave the "
         f"common motion by more than {gate}; a landmark restarts there (standard deviation of the rest: {scale})"
     )
-
-
-def _numbers(gate: str | Array) -> Array:
-    if not isinstance(gate, str):
-        return gate
-    try:
-        return np.array(gate.split(","), float)
-    except ValueError:
-        return np.zeros(0)

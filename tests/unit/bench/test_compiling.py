@@ -15,7 +15,7 @@ import pytest
 
 from consistency.bench.filters.compiled import Compiled
 from consistency.bench.filters.compiler import jit
-from consistency.bench.filters.compiler.jit import Content, Kernel, Outlook
+from consistency.bench.filters.compiler.jit import Content, Outlook
 from consistency.bench.filters.run_filter import resolve_filters
 from consistency.bench.runs import run_outcome
 from consistency.bench.runs.reproduce_findings import experiments
@@ -219,20 +219,6 @@ def outer(x):
 
 def test_the_size_is_that_of_all_functions():
     assert Content(outer, ()).size == sum(len(f.__code__.co_code) for f in (inner, outer))
-
-
-def test_a_kernel_is_ready_once_it_is_compiled(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    kernel = Kernel(total)
-    first = kernel.outlook(1)
-    assert (first.is_ready, first.is_shared, first.size) == (False, True, len(total.__code__.co_code))
-    assert kernel(1.0) == 2.0
-    assert kernel.outlook(1.0).is_ready
-    assert kernel.outlook(1) == first
-
-
-def total(x):
-    return x + x
 
 
 def test_the_largest_kernel_is_compiled_first(monkeypatch):

@@ -137,7 +137,10 @@ def with_effects(small, *effects, name="herath2007-stereo", **changes):
 
 
 def plainly(scenario, run, seed):
-    """Steps, landmarks and z of a trial without any effects as parts: one loop over steps, noise at the end."""
+    """A trial without any effects as parts: one loop over steps, noise at the end.
+
+    Returns the controls that are told, the path without its start, and steps, landmarks and z of what is observed.
+    """
     truth, sensor = scenario.truth, scenario.truth.sensor
     streams = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, purpose))) for purpose in (0, 1)]
     v_omega = streams[0].standard_normal((truth.steps, 2)) * [truth.motion.sigma_v, truth.motion.sigma_omega]
@@ -146,6 +149,8 @@ def plainly(scenario, run, seed):
         v, omega = v + noise[0], omega + noise[1]
         pose = pose + dt * np.array([v * np.cos(pose[2]), v * np.sin(pose[2]), omega])
         path.append(pose)
+    if truth.motion.noise_on == "odometry":
+        controls[:, 1:] -= v_omega
     landmarks, mount = draw_landmarks(truth), sensor.mount.packed()
     step, landmark, z = [], [], []
     for k, (x, y, heading) in enumerate(path, start=1):
@@ -163,7 +168,7 @@ def plainly(scenario, run, seed):
     kept = np.ones(len(z), bool)
     if sensor.model == "uvd":
         kept = (measured[:, 2] >= sensor.disparity[0]) & (measured[:, 2] <= sensor.disparity[1])
-    return np.array(step)[kept], np.array(landmark)[kept], measured[kept]
+    return controls, np.array(path), np.array(step)[kept], np.array(landmark)[kept], measured[kept]
 
 
 @pytest.mark.parametrize("noise_on", ["odometry", "motion"])
@@ -172,7 +177,9 @@ def test_field_of_view_noise_and_search_range_are_a_plain_sensor(small, tilted, 
     changes = {"truth__sensor__disparity": (4.0, 9.0)} if name == "herath2007-stereo" else {}
     scenario = small(name, truth__motion__noise_on=noise_on, truth__sensor__mount=tilted, **changes)
     trial = cs.simulate(scenario, run=2, seed=3)
-    step, landmark, z = plainly(scenario, 2, 3)
+    controls, path, step, landmark, z = plainly(scenario, 2, 3)
+    assert np.allclose(trial.controls, controls, rtol=0, atol=1e-12)
+    assert np.allclose(trial.truth[1:], path, rtol=0, atol=1e-9)
     assert np.array_equal(trial.step, step)
     assert np.array_equal(trial.landmark, landmark)
     assert np.allclose(trial.z, z, rtol=0, atol=1e-9)

@@ -1,6 +1,5 @@
 """How reproduce runs scripts: which of them, in which process, and what becomes of one that breaks."""
 
-import contextlib
 import json
 import os
 import time
@@ -110,10 +109,17 @@ def test_what_was_not_run_is_listed_with_how_to_run_it(scripts, tmp_path):
     assert listed["one"] == []
 
 
-@pytest.mark.parametrize("name", ["e05_script", "cinq"])
-def test_a_finding_on_data_that_are_not_shipped_is_refused(scripts, tmp_path, name):
+@pytest.mark.parametrize(
+    "name, said",
+    [
+        ("e05_script", r"its data are not shipped; python .*e05_script\.py --help"),
+        ("cinq", "its data are not shipped"),
+        ("e99", "no such finding or experiment; known: one, uno"),
+    ],
+)
+def test_what_cannot_be_reproduced_is_refused(scripts, tmp_path, name, said):
     write(scripts, 5, ("five", "cinq"), "NOT_SHIPPED = 'images of a drive'")
-    with pytest.raises(InputError, match=rf"--only {name}: its data are not shipped; python .*e05_script\.py --help"):
+    with pytest.raises(InputError, match=f"--only {name}: {said}"):
         reproduce([name], 5, 0, 1, tmp_path / "out")
 
 
@@ -134,18 +140,20 @@ def test_the_report_lists_what_was_not_run(scripts, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "source, holds, status, said",
+    "source, verdict, status, said",
     [
-        ("Herath 2007", True, 0, ""),
-        ("Herath 2007", None, 0, "not shown: one"),
-        ("Herath 2007", False, 1, "not reproduced: one"),
-        ("this project", None, 0, "not shown: one"),
-        ("this project", False, 0, "not shown: one"),
+        ("Herath 2007", "reproduced", 0, ""),
+        ("Herath 2007", "not shown", 0, "not shown: one"),
+        ("Herath 2007", "not reproduced", 1, "not reproduced: one"),
+        ("Herath 2007", "refuted", 1, "refuted: one"),
+        ("this project", "not shown", 0, "not shown: one"),
+        ("this project", "not reproduced", 0, "not shown: one"),
+        ("this project", "refuted", 0, "refuted: one (conjectures of this project, which may be refuted: no failure)"),
     ],
 )
-def test_exit_status_of_each_verdict(tmp_path, monkeypatch, capsys, source, holds, status, said):
+def test_exit_status_of_each_verdict(tmp_path, monkeypatch, capsys, source, verdict, status, said):
     text = dict.fromkeys(("claim", "statistic", "published", "measured", "accept"), "text")
-    finding = Study(jobs=1).finding(holds, "none", id="one", source=source, **text)
+    finding = replace(Study(jobs=1).finding(None, "none", id="one", source=source, **text), verdict=verdict)
     monkeypatch.setattr(module, "reproduce", lambda *_: [finding])
     monkeypatch.setattr("consistency.bench.pages.write_reports", lambda *_, **__: ())
     ended = 0
@@ -155,19 +163,6 @@ def test_exit_status_of_each_verdict(tmp_path, monkeypatch, capsys, source, hold
         ended = exit_.exit_code
     assert ended == status
     assert capsys.readouterr().err.strip() == said
-
-
-@pytest.mark.parametrize(
-    "source, said", [("this project", "may be refuted: no failure)"), ("Herath 2007", "refuted: one")]
-)
-def test_a_conjecture_may_be_refuted(tmp_path, monkeypatch, capsys, source, said):
-    text = dict.fromkeys(("claim", "statistic", "published", "measured", "accept"), "text")
-    finding = replace(Study(jobs=1).finding(None, "none", id="one", source=source, **text), verdict="refuted")
-    monkeypatch.setattr(module, "reproduce", lambda *_: [finding])
-    monkeypatch.setattr("consistency.bench.pages.write_reports", lambda *_, **__: ())
-    with contextlib.suppress(typer.Exit):
-        reproduce_command(["one"], jobs=1, out=tmp_path)
-    assert capsys.readouterr().err.strip().endswith(said)
 
 
 def test_the_terminal_lists_what_was_not_run(scripts, tmp_path, monkeypatch, capsys):
@@ -218,19 +213,10 @@ def test_unusable_input_ends_everything(scripts, tmp_path, jobs):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_script_apart_runs_no_filter(scripts, tmp_path):
+def test_a_script_apart_runs_no_filter(scripts):
     write(scripts, 2, ("two",), "OWN_PROCESS = True", "study.kept['world'] = None")
-    found = measured(reproduce(["two"], 5, 0, 2, tmp_path / "out"))
-    assert found["two"] == "ValueError: OWN_PROCESS is for scripts that run no filter"
-
-
-@pytest.mark.parametrize(
-    "name, told",
-    [("e09_kitti07", r"its data are not shipped; python .*e09_kitti07\.py --help"), ("e99", "no such finding")],
-)
-def test_what_cannot_be_reproduced_is_refused(tmp_path, name, told):
-    with pytest.raises(InputError, match=f"--only {name}: {told}"):
-        reproduce([name], 5, 0, 1, tmp_path / "out")
+    with pytest.raises(ValueError, match="OWN_PROCESS is for scripts that run no filter"):
+        module._contribution(str(scripts / "e02_script.py"), 5, 0, 1)
 
 
 def test_jobs_out_of_range():

@@ -217,13 +217,10 @@ def test_changed_bytes_are_refused(written, tmp_path, name):
     cs.read_results(written).write(tmp_path / "out")
     path = tmp_path / "out" / f"{name}.parquet"
     damage(path)
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: is not as it was written, but damaged or edited"):
-        open_results(tmp_path / "out")
     accept_changes(tmp_path / "out")
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        cs.analyse(open_results(tmp_path / "out"))
-    with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
-        cs.read_results(tmp_path / "out")
+    for read in (open_results, cs.read_results):
+        with pytest.raises(cs.InputError, match=rf"{name}\.parquet: cannot be read, damaged or cut short"):
+            cs.analyse(read(tmp_path / "out"))
 
 
 def test_a_row_of_no_filter_is_refused(written, tmp_path):
@@ -390,21 +387,18 @@ def test_ctrl_c_waits_while_the_folder_is_written(run, tmp_path, monkeypatch):
 # --- nothing half-written ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_in_the_middle_leaves_the_finished_runs(run, written, tmp_path, stop_at, monkeypatch, jobs):
+def test_an_error_in_the_middle_leaves_the_finished_runs(run, written, tmp_path, stop_at, monkeypatch):
     out = tmp_path / "deep" / "out"
     stop_at(5, RuntimeError("out of ideas"))
     with pytest.raises(RuntimeError, match="out of ideas"):
-        run(jobs=jobs, out=out)
+        run(out=out)
     monkeypatch.undo()
     assert [path.name for path in out.parent.iterdir()] == [".out.unfinished"]
     done = []
     trial = World.trial
     monkeypatch.setattr(World, "trial", lambda self, run, seed: (done.append(run), trial(self, run, seed))[1])
     run(out=out, resume=True)
-    assert 5 in done
-    # a thread may be ahead, or behind with what is then given up; the system decides
-    assert set(done) <= {5, 6, 7, 8} if jobs == 1 else len(set(done)) < 8
+    assert {5} <= set(done) <= {5, 6, 7, 8}
     assert content(out) == content(written)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 

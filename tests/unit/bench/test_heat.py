@@ -13,7 +13,6 @@ from consistency.bench.pages.sweep_report import colour_of, heat_figure, ink_on
 from consistency.bench.sweeps.regime_map import Regime, regime_blocks
 from consistency.bench.sweeps.run_sweep import CellResult, plain_numbers, result_from
 from consistency.bench.sweeps.sweep_file import Axis, load_sweep
-from consistency.referee.show.figures import svg
 from consistency.referee.show.terminal import show
 
 LONG = [{"kind": "mismatch", "rate": 0.05}]
@@ -139,17 +138,6 @@ def test_colours_say_which_way():
     assert red > blue, "towards vermilion"
     assert ink_on(heat.PAPER) == ink_on(heat.SMALL) == "#000000"
     assert ink_on("#0072b2") == "#ffffff"
-
-
-def test_page_and_paper_show_it(tmp_path):
-    regime = regime_of(sweep_over(**GRIDS["four"]))
-    page, sheets = write_regime_reports(regime, tmp_path)
-    text = page.read_text(encoding="utf-8")
-    assert text.count(">overconf.</text>") == len(regime.sweep.cells)
-    assert "<title>overconfident, covariance ratio 1.00 [0.50, ∞], 12 runs" in text
-    assert sheets.stat().st_size > 10_000
-    for draw in heat_figure(regime, "a").drawings:
-        assert "overconf." in svg(draw)
 
 
 @pytest.mark.parametrize("name", GRIDS)

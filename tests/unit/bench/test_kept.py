@@ -68,6 +68,18 @@ def test_damaged_code_is_compiled_anew_and_said_once(cache, capsys, damage):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="there are no modes on this system")
+def test_a_folder_that_others_may_write_is_not_trusted(cache, capsys):
+    use()
+    folder = code_in(cache).parent
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    assert use() == (False, 0)
+    said = capsys.readouterr().err
+    assert "somebody else may write there" in said
+    assert said.count("\n") == 1
+
+
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners on this system")
 def test_code_of_another_owner_is_neither_loaded_nor_overwritten(cache, monkeypatch, capsys):
     use()

@@ -10,7 +10,6 @@ import consistency as cs
 from consistency.bench.runs.run_outcome import TrialWork as Runs
 from consistency.bench.scenario import data_folder
 from consistency.bench.store.journal import Journal, Unfinished
-from consistency.bench.sweeps import run_sweep as cells
 from consistency.bench.sweeps import run_sweep as sweeping
 from consistency.bench.sweeps.run_sweep import SweepFolder, cost_of, run_sweep
 from consistency.bench.sweeps.sweep_file import load_sweep
@@ -38,7 +37,7 @@ def at(tmp_path, monkeypatch):
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
     (tmp_path / "grid.toml").write_text(GRID)
-    monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
+    monkeypatch.setattr(sweeping, "cost_of", lambda *_: (1.0, 5.0))
     monkeypatch.setattr(sweeping, "PAUSE", 0.01)
     return tmp_path
 
@@ -103,7 +102,7 @@ def test_a_sweep_goes_on_within_a_cell(at, stop_after, monkeypatch, error):
     with pytest.raises(type(error)):
         run_sweep(grid(at), at / "out", jobs=1)
     monkeypatch.undo()
-    monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
+    monkeypatch.setattr(sweeping, "cost_of", lambda *_: (1.0, 5.0))
     assert len(content(at / "out")) == 1
     done = stop_after(-1, error)
     folder = run_sweep(grid(at), at / "out", jobs=1)
@@ -121,9 +120,9 @@ def test_runs_of_other_inputs_are_dropped(at, stop_after, monkeypatch, old, new)
     with pytest.raises(Killed):
         run_sweep(grid(at), at / "out", jobs=1)
     monkeypatch.undo()
-    monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
+    monkeypatch.setattr(sweeping, "cost_of", lambda *_: (1.0, 5.0))
     if new == "code":
-        monkeypatch.setattr("consistency.bench.sweeps.run_sweep.code_digest", lambda: "another")
+        monkeypatch.setattr(sweeping, "code_digest", lambda: "another")
         new = ""
     sweep = grid(at, old, new) if old else grid(at)
     done = stop_after(-1, Killed())
@@ -167,7 +166,7 @@ def test_a_cell_that_another_process_works_on(at, monkeypatch, is_done):
     """Others are done first; it is come back to, and done only if the other has not."""
     folder, first = others_cell(at, 0)
     run_sweep(grid(at), at / "whole", jobs=1)
-    run_cell, done, free = cells.run_cell, list[str](), threading.Event()
+    run_cell, done, free = sweeping.run_cell, list[str](), threading.Event()
 
     def counted(sweep, cell, *rest, **how):
         done.append(cell.name)
@@ -198,7 +197,7 @@ def test_a_cell_that_another_process_works_on(at, monkeypatch, is_done):
 def test_a_cell_that_was_done_after_the_sweep_began(at, monkeypatch):
     """Another process has finished the last cell when it is its turn."""
     folder, last = others_cell(at, -1)
-    run_cell, done = cells.run_cell, list[str]()
+    run_cell, done = sweeping.run_cell, list[str]()
 
     def meanwhile(sweep, cell, *rest, **how):
         if not done:
@@ -235,7 +234,7 @@ def test_a_filter_that_fails_apart_is_not_timed_here(uvd, monkeypatch):
 
         predict = update = pose = init
 
-    get_filter = cells.get_filter
-    monkeypatch.setattr(cells, "get_filter", lambda name: Crashes() if name == "crashes" else get_filter(name))
-    monkeypatch.setattr(cells, "run_filter", None)
+    get_filter = sweeping.get_filter
+    monkeypatch.setattr(sweeping, "get_filter", lambda name: Crashes() if name == "crashes" else get_filter(name))
+    monkeypatch.setattr(sweeping, "run_filter", None)
     assert np.isnan(cost_of("crashes", "ekf-uvd", uvd, 0)).all()

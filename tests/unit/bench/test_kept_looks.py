@@ -54,7 +54,7 @@ def test_the_folder_is_that_of_a_plain_run_with_the_plan(world, whole, tmp_path)
     assert [path.name for path in whole.parent.iterdir()] == ["whole"]
 
 
-@pytest.mark.parametrize("run", [5, 13, 19], ids=["before a look", "between looks", "the last"])
+@pytest.mark.parametrize("run", [5, 19], ids=["before a look", "the last"])
 def test_what_ends_the_process_takes_no_finished_run(world, whole, tmp_path, stop_at, monkeypatch, run):
     with monkeypatch.context() as patch:
         patch.setattr(outcomes_to_results.Gathered, "results", None)  # as SIGKILL: nothing is written any more
@@ -71,24 +71,6 @@ def test_what_ends_the_process_takes_no_finished_run(world, whole, tmp_path, sto
     assert render(document(verdicts)) == render(document(cs.analyse(open_results(whole))))
     assert plan_in(tmp_path / "out") == plan_in(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_killed_while_the_tables_are_written(world, whole, tmp_path, stop_at, monkeypatch):
-    """All runs are there and decide: the resume writes them, and does none."""
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(outcomes_to_results.Writer, "add", full)
-        with pytest.raises(cs.InputError, match="20 finished runs are kept, and the same command with --resume"):
-            run_until_decided(world, ["kf"], out=tmp_path / "out", **OPEN)
-    done = stop_at(-1, RuntimeError())
-    run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
-    assert done == []
-    assert content(tmp_path / "out") == content(whole)
-    with pytest.raises(cs.InputError, match="have 20 runs; the plan looks for the last time at 20"):
-        run_until_decided(world, ["kf"], out=tmp_path / "out", resume=True, **OPEN)
 
 
 @pytest.mark.parametrize("look", [False, True])

@@ -215,16 +215,6 @@ def test_bad_sensor_file(folder, case):
 # --- writing -------------------------------------------------------------------------------------
 
 
-def test_an_error_while_writing_leaves_nothing(uvd, tmp_path, monkeypatch):
-    def full(*args, **options):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises((OSError, cs.InputError), match="No space left"):
-        simulate_log(uvd, runs=1, seed=0, out=tmp_path / "log")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("runs, seed, complaint", [(0, 0, "runs must be at least 1"), (1, -1, "seed must not be")])
 def test_counts_are_checked(uvd, tmp_path, runs, seed, complaint):
     with pytest.raises(cs.InputError, match=complaint):

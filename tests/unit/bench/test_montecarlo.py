@@ -203,12 +203,6 @@ def test_resuming_what_is_complete_needs_no_compiler(uvd, ten, monkeypatch):
     assert equal(cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=10, seed=3, jobs=1, previous=ten), ten)
 
 
-def test_resuming_with_fewer_runs_than_there_are_is_refused(uvd, ten):
-    """A folder must not hold more runs than its manifest says."""
-    with pytest.raises(cs.InputError, match="runs"):
-        cs.run_trials(uvd, ["ekf-uvd", "ekf-xyz"], runs=5, seed=3, jobs=1, previous=ten)
-
-
 @pytest.mark.parametrize(
     "change, key",
     [({"seed": 4}, "seed"), ({"filters": ["ekf-uvd"]}, "filter"), ({"truth__steps": 61}, "scenario")],

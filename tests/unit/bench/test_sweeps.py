@@ -13,8 +13,6 @@ import consistency as cs
 from consistency.bench.runs.montecarlo import run_until_decided
 from consistency.bench.scenario import data_folder
 from consistency.bench.scenario.truth_and_belief import with_changes
-from consistency.bench.sweeps import run_sweep as cells
-from consistency.bench.sweeps import run_sweep as folders
 from consistency.bench.sweeps import run_sweep as sweeping
 from consistency.bench.sweeps.regime_map import Regime, ranked_by_cost, read_regime, regime_of, write_regime
 from consistency.bench.sweeps.run_sweep import (
@@ -50,15 +48,15 @@ def at(tmp_path, monkeypatch):
     text = (data_folder("scenarios") / "linear-gaussian.toml").read_text()
     (tmp_path / "small.toml").write_text(text.replace("steps = 500", "steps = 30"))
     (tmp_path / "grid.toml").write_text(LINEAR)
-    monkeypatch.setattr(cells, "cost_of", lambda *_: (1.0, 5.0))
+    monkeypatch.setattr(sweeping, "cost_of", lambda *_: (1.0, 5.0))
     return tmp_path
 
 
-def edited(at, old, new, name="other.toml"):
+def edited(at, old, new):
     """The sweep with a part of its text replaced."""
     assert old in LINEAR
-    (at / name).write_text(LINEAR.replace(old, new))
-    return at / name
+    (at / "other.toml").write_text(LINEAR.replace(old, new))
+    return at / "other.toml"
 
 
 # --- the grid -----------------------------------------------------------------------------------
@@ -149,7 +147,7 @@ DAMAGED = [
     {"grid": {}, "alone": {}},
     {"grid": {"odometry": []}},
     {"grid": {"odometry": ["loud"]}},
-    {"grid": {"odometry": list(range(1, 20_003))}},
+    {"grid": {"odometry": list(range(1, 151)), "density": list(range(1, 151))}},
     {"filters": "kf"},
     {"seed": "a"},
     {"rule": 5},
@@ -249,10 +247,6 @@ def test_bad_sweeps(at, case):
 # --- the folder ---------------------------------------------------------------------------------
 
 
-def numbers(folder):
-    return dict(folder.results())
-
-
 def test_a_cell_has_the_verdict_of_a_run_until_decided(at):
     sweep = load_sweep(at / "grid.toml")
     folder = run_sweep(sweep, at / "out", jobs=1)
@@ -272,35 +266,6 @@ def test_a_cell_has_the_verdict_of_a_run_until_decided(at):
     assert runs["reason"].isna().all()
 
 
-def test_a_sweep_that_is_stopped_while_a_cell_writes_goes_on(at, monkeypatch):
-    """What is finished stays, and all numbers are those of one go."""
-    sweep = load_sweep(at / "grid.toml")
-    whole = run_sweep(sweep, at / "whole", jobs=1)
-
-    def stops_while_writing(self, work, outcome, wall):
-        if len(list((at / "out").rglob("runs.csv"))) == 2:
-            with monkeypatch.context() as patch:
-                patch.setattr(pd.DataFrame, "to_csv", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
-                write(self, work, outcome, wall)
-        write(self, work, outcome, wall)
-
-    write = SweepFolder.write
-    with monkeypatch.context() as patch:
-        patch.setattr(SweepFolder, "write", stops_while_writing)
-        with pytest.raises(KeyboardInterrupt):
-            run_sweep(sweep, at / "out", jobs=1)
-    assert len(list((at / "out").rglob("runs.csv"))) == 2
-    hidden = [path.name for path in (at / "out").rglob(".*") if path.is_dir()]
-    assert hidden == [".kf.unfinished"]  # the runs of the cell; nothing else is half written
-    kept = {path: path.read_bytes() for path in (at / "out").rglob("runs.csv")}
-    done = []
-    monkeypatch.setattr(sweeping, "run_cell", lambda *a, **o: (done.append(a), run_cell(*a, **o))[1])
-    folder = run_sweep(sweep, at / "out", jobs=1)
-    assert len(done) == 2
-    assert {path: path.read_bytes() for path in kept} == kept
-    assert repr(numbers(folder)) == repr(numbers(whole))
-
-
 def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     done = []
@@ -311,29 +276,27 @@ def test_more_values_and_filters_go_into_the_same_folder(at, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "old, new, what",
-    [("max_runs = 12", "max_runs = 13", "max_runs"), ("seed = 3", "seed = 4", "seed"), ("seed", "seed", "source code")],
+    "name, old, new, what",
+    [
+        ("grid.toml", "max_runs = 12", "max_runs = 13", "max_runs"),
+        ("grid.toml", "seed = 3", "seed = 4", "seed"),
+        ("small.toml", "steps = 30", "steps = 31", "scenario"),
+        ("grid.toml", "seed", "seed", "source code"),
+    ],
 )
-def test_changed_inputs_are_refused_or_run_again(at, monkeypatch, old, new, what):
+def test_changed_inputs_are_refused_or_run_again(at, monkeypatch, name, old, new, what):
     run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
     before = {path: path.read_bytes() for path in (at / "out").rglob("*.*") if path.is_file()}
     if what == "source code":
-        monkeypatch.setattr(folders, "code_digest", lambda: "another")
-    sweep = load_sweep(edited(at, old, new, "grid.toml"))
+        monkeypatch.setattr(sweeping, "code_digest", lambda: "another")
+    (at / name).write_text((at / name).read_text().replace(old, new))
+    sweep = load_sweep(at / "grid.toml")
     with pytest.raises(InputError, match=rf"made with another {what} .*\(and 3 more\); add --overwrite"):
         run_sweep(sweep, at / "out", jobs=1)
     assert {path: path.read_bytes() for path in before} == before
     assert SweepFolder(sweep, at / "out").results() == {}  # nothing is mixed into a map
     folder = run_sweep(sweep, at / "out", jobs=1, overwrite=True)
     assert len(folder.results()) == 4
-
-
-def test_a_changed_world_is_refused(at):
-    run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
-    text = (at / "small.toml").read_text()
-    (at / "small.toml").write_text(text.replace("steps = 30", "steps = 31"))
-    with pytest.raises(InputError, match="made with another scenario"):
-        run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
 
 
 def test_a_folder_of_something_else_is_refused(at):
@@ -347,23 +310,14 @@ def test_a_folder_of_something_else_is_refused(at):
         run_sweep(load_sweep(at / "grid.toml"), at / "results")
 
 
-def test_a_cell_that_raises_is_a_result(at):
-    """Nothing is in view in one cell, and the filter fails in no other."""
-    path = edited(at, "density = [0.5, 1.0]", "truth.sensor.range = [[0.001, 0.002], [0.5, 4.0]]")
-    folder = run_sweep(load_sweep(path), at / "out", jobs=1)
-    broken = [r for r in folder.results().values() if r.status == "failed"]
-    assert len(broken) == 2
-    assert all("no landmark comes into view" in r.diagnosis and r.runs == 0 for r in broken)
-    assert np.isnan(broken[0].rmse_position)
-
-
 def test_any_exception_is_a_result(at, monkeypatch):
     def breaks(*_, **__):
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr(cells, "run_until_decided", breaks)
-    folder = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1)
-    assert {r.diagnosis for r in folder.results().values()} == {"failed: ZeroDivisionError: by nothing"}
+    monkeypatch.setattr(sweeping, "run_until_decided", breaks)
+    found = run_sweep(load_sweep(at / "grid.toml"), at / "out", jobs=1).results().values()
+    assert {(r.status, r.diagnosis, r.runs) for r in found} == {("failed", "failed: ZeroDivisionError: by nothing", 0)}
+    assert np.isnan([r.rmse_position for r in found]).all()
 
 
 def test_a_damaged_cell_is_named(at):
@@ -386,9 +340,9 @@ def test_the_cost_is_the_least_of_three_by_turns(uvd, monkeypatch):
         clock[0] += next(seconds[filter_.name])
         return SimpleNamespace(failure=None)
 
-    monkeypatch.setattr(cells, "run_filter", run_filter)
-    monkeypatch.setattr(cells.time, "thread_time", lambda: clock[0])
-    monkeypatch.setattr(cells, "compile_all", lambda wanted: None)
+    monkeypatch.setattr(sweeping, "run_filter", run_filter)
+    monkeypatch.setattr(sweeping.time, "thread_time", lambda: clock[0])
+    monkeypatch.setattr(sweeping, "compile_all", lambda wanted: None)
     cost, microseconds = cost_of("ukf-uvd", "ekf-uvd", uvd, 0)
     assert order == ["ukf-uvd", "ekf-uvd"] * 3
     assert cost == pytest.approx(4.0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import characterisation as benchmark
 import numpy as np
 import pytest
+from painted import by_title, panels
 from scipy import stats
 
 import consistency as cs
@@ -40,6 +41,7 @@ from consistency.stereo.characterising.coordinate_fit import (
     tails,
 )
 from consistency.stereo.characterising.sensor_text import sentences
+from consistency.stereo.pages import compose_sensor
 
 LEVEL = 1e-7
 SENSOR = PicturedSensor(model="uvd", sigma=(1.0, 1.0, 1.0), f=150.0, B=0.09, disparity=(1.0, 32.0), image=(320, 240))
@@ -380,3 +382,11 @@ def test_a_characterisation_says_what_it_left_out(rng):
     of = characterise(data_of(rng, 3000, (1.0, 1.0, 0.5)), SENSOR, "here", strange=7)
     assert of.left_out["of no landmark"] == 7
     assert of.rows + sum(of.left_out.values()) == 3007
+
+
+def test_all_lags_are_within_their_axes(rng):
+    of = characterise(data_of(rng, 3000, (1.0, 1.0, 0.5)), SENSOR, "here")
+    u, *others = of.coordinates
+    falling = replace(of, coordinates=(replace(u, lags=np.where(np.isfinite(u.lags), -0.6, np.nan)), *others))
+    drawn = panels(by_title(compose_sensor(falling, {}))["Autocorrelation"])
+    assert [axes.get_ylim() for axes in drawn] == 3 * [pytest.approx((-0.69, 0.69))]

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import scene
 from numpy.testing import assert_allclose, assert_array_equal
@@ -31,7 +30,7 @@ from consistency.stereo.frontend.images_to_log import (
 from consistency.stereo.visual_odometry.odometry import trajectory, visual_odometry
 from consistency.stereo.visual_odometry.relative_motion import ESTIMATORS, MotionSettings, RelativeMotion
 from consistency.stereo.visual_odometry.sequence import read_sequence
-from consistency.stereo.visual_odometry.tracks import TrackSelection, linked, thinned
+from consistency.stereo.visual_odometry.tracks import linked
 from consistency.vision import ConsensusError, RelativePose, relative_motion
 
 pytest.importorskip("cv2", reason="OpenCV (the extra vision) is not installed")
@@ -143,15 +142,6 @@ def test_a_dark_frame_is_bridged(wall, tmp_path):
 def test_matches_of_consecutive_pairs_become_tracks():
     links = [np.array([[0, 5], [1, 6]]), np.array([[6, 2], [7, 3]]), np.array([[2, 0], [9, 1]])]
     assert [t.tolist() for t in linked(links)] == [[0, 1], [1, 2], [1, 3]]
-
-
-def test_long_tracks_are_cut_at_two_ages_and_short_ones_left_out():
-    long, short = np.arange(30), np.arange(5, 7)
-    piece = np.repeat([0, 1], [len(long), len(short)])
-    rows = pd.DataFrame({"piece": piece, "step": np.concatenate([long, short]), "z0": 0.0, "z1": 0.0, "z2": 9.0})
-    found = thinned(rows, TrackSelection(slots=2, max_age=12, min_life=3, bands=3, width=100.0))
-    assert np.bincount(found["landmark"]).tolist() == [6, 12, 11]
-    assert found["step"].tolist() == list(range(1, 30))
 
 
 def test_motions_begin_with_the_identity():

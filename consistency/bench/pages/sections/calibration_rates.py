@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,27 +92,22 @@ def calibration(path: Path | None = None) -> Calibration | None:
     if path is None or not path.is_file():
         return None
     data = json.loads(path.read_text(encoding="utf-8"))
-    return Calibration(
-        data["steps"], data["dof"], data["seed"], data["questions"], data["worlds"], tuple(_rates(data["rows"]))
-    )
+    rows, rates = data["rows"], list[Rate]()
+    found = np.array([row["found"] for row in rows], float)
+    gates = np.array([row["gates"] for row in rows], float)
+    intervals = zip(*binomial_interval(found, gates, CONFIDENCE), strict=True)
+    for row, (low, high) in zip(rows, intervals, strict=True):
+        rates.append(Rate(
+            row["world"], row["question"], row["ratio"], row["runs"], row["looks"], row.get("mean_runs", row["runs"]),
+            row["stated"], row["bound"] == "<=", row["gates"], row["found"] / row["gates"], (float(low), float(high)),
+        ))  # fmt: skip
+    return Calibration(data["steps"], data["dof"], data["seed"], data["questions"], data["worlds"], tuple(rates))
 
 
 def shipped() -> Path | None:
     """The file inside the wheel, else in the checkout."""
     places = (data_folder("reference"), data_folder("reports") / "reference")
     return next((place / NAME for place in places if (place / NAME).is_file()), None)
-
-
-def _rates(rows: Iterable[dict[str, Any]]) -> Iterable[Rate]:
-    rows = list(rows)
-    found = np.array([row["found"] for row in rows], float)
-    gates = np.array([row["gates"] for row in rows], float)
-    intervals = zip(*binomial_interval(found, gates, CONFIDENCE), strict=True)
-    for row, (low, high) in zip(rows, intervals, strict=True):
-        yield Rate(
-            row["world"], row["question"], row["ratio"], row["runs"], row["looks"], row.get("mean_runs", row["runs"]),
-            row["stated"], row["bound"] == "<=", row["gates"], row["found"] / row["gates"], (float(low), float(high)),
-        )  # fmt: skip
 
 
 def calibration_rates() -> tuple[Block, ...]:

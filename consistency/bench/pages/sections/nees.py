@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 DIMENSION = "3"  # of a pose: what is expected where no filter has a band
 PANELS = 4  # small ones beside each other
-WINDOW = (-0.02, 1.02)
+WINDOW, TICKS = (-0.02, 1.02), (0.0, 0.5, 1.0)  # of a distribution function
 OF_DISTRIBUTION = (
     "Chi-square probability of the NEES in one step of each run, with nothing fitted. "
     "On the diagonal the covariance is right; a curve below it has too many large values (overconfident), above it "
@@ -75,12 +75,15 @@ def anees_of(study: Study) -> Anees | None:
     shared, curves = common({track.name: track.verdict for track in study.tracks}), []
     for track in study.tracks:
         scale, location = track.verdict.scale, track.verdict.location
-        if scale is not None:
-            simultaneous = None if location is None else location.simultaneous
-            own_band = _fewer(track.verdict, shared)
-            curves.append(
-                Curve(track, scale.anees, scale.band, simultaneous, own_band, *_without_far_runs(track, scale))
-            )
+        if scale is None:
+            continue
+        own_band = False
+        if shared is not None and shared.scale is not None:
+            is_same = np.array_equal(scale.band, shared.scale.band, equal_nan=True)
+            own_band = not is_same and (bool(track.verdict.failures) or track.verdict.runs < shared.runs)
+        simultaneous = None if location is None else location.simultaneous
+        others, far = _without_far_runs(track, scale)
+        curves.append(Curve(track, scale.anees, scale.band, simultaneous, own_band, others, far))
     return Anees(study, tuple(curves))
 
 
@@ -100,13 +103,6 @@ def common(verdicts: dict[str, Verdict]) -> Verdict | None:
     judged = [(v, v.scale) for v in verdicts.values() if v.scale is not None and v.scale.judged_steps]
     best = min(judged, key=lambda p: (-p[0].runs, len(p[0].failures), -int(p[1].alive.sum())), default=None)
     return None if best is None else best[0]
-
-
-def _fewer(verdict: Verdict, shared: Verdict | None) -> bool:
-    if verdict.scale is None or shared is None or shared.scale is None:
-        return False
-    same = np.array_equal(verdict.scale.band, shared.scale.band, equal_nan=True)
-    return not same and (bool(verdict.failures) or verdict.runs < shared.runs)
 
 
 def anees_curves(study: Study) -> tuple[Figure, ...]:
@@ -230,20 +226,16 @@ def nees_distribution(study: Judged) -> tuple[Figure, ...]:
         # panels that are nearly square
         figure, panels = canvas(1.45 * rows, columns, len(filters), width=WIDTH * columns / PANELS + 0.2, sharey=True)
         for axes, of in zip(panels, filters, strict=True):
-            _draw_steps(axes, of)
+            corners = np.unique([0.0, of.half_width, 1.0 - of.half_width, 1.0])
+            ends = np.clip(corners[:, None] + [-of.half_width, of.half_width], 0.0, 1.0)
+            band(axes, corners, ends, "95 % band of the whole curve")
+            axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
+            look = replace(solid(of.track.look), width=1.3)
+            curve(axes, of.x, of.y, look, "", of.track.tag, drawstyle="steps-post")
+            axes.set(xlabel="chi-square cdf", title=of.track.name)
+            axes.set(xlim=WINDOW, ylim=WINDOW, xticks=TICKS, yticks=TICKS)
         for axes in panels[::PANELS]:
             axes.set_ylabel("share of runs")
         return add_legend(figure)
 
     return (Figure("Distribution of the NEES", OF_DISTRIBUTION, (draw,), level=4),)
-
-
-def _draw_steps(axes: Axes, of: Steps) -> None:
-    corners = np.unique([0.0, of.half_width, 1.0 - of.half_width, 1.0])
-    ends = np.clip(corners[:, None] + [-of.half_width, of.half_width], 0.0, 1.0)
-    band(axes, corners, ends, "95 % band of the whole curve")
-    axes.plot([0.0, 1.0], [0.0, 1.0], **stroke(EXPECTED), label="expected")
-    look = replace(solid(of.track.look), width=1.3)
-    curve(axes, of.x, of.y, look, "", of.track.tag, drawstyle="steps-post")
-    ticks = (0.0, 0.5, 1.0)
-    axes.set(xlabel="chi-square cdf", title=of.track.name, xlim=WINDOW, ylim=WINDOW, xticks=ticks, yticks=ticks)

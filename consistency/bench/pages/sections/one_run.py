@@ -52,7 +52,12 @@ def world_of(study: Study) -> DrawnWorld:
     truth = values[np.argsort(step, kind="stable")] if len(values) else None
     landmarks = study.results.landmarks
     places = None if landmarks is None else landmarks[["x", "y"]].to_numpy(float)
-    return DrawnWorld(study, tuple(paths), truth, _odometry(study), places)
+    scenario, seed = study.results.scenario, study.results.manifest.get("seed")
+    odometry = None  # results keep no controls, but a simulated trial can be drawn again
+    if scenario is not None and seed is not None:
+        trial = simulate(scenario, study.shown_run, int(seed))
+        odometry = dead_reckoning(trial.start, trial.controls)[:, :2]
+    return DrawnWorld(study, tuple(paths), truth, odometry, places)
 
 
 def _of_shown_run(study: Study, table: str, filter_name: str | None = None) -> tuple[Indices, Array]:
@@ -62,15 +67,6 @@ def _of_shown_run(study: Study, table: str, filter_name: str | None = None) -> t
         rows.append(np.stack([batch["step"], batch["x"], batch["y"]], axis=-1)[batch["run"] == study.shown_run])
     found = np.concatenate(rows)
     return found[:, 0].astype(np.int64), found[:, 1:]
-
-
-def _odometry(study: Study) -> Array | None:
-    """The path by the controls alone; results keep no controls, but a simulated trial can be drawn again."""
-    scenario, seed = study.results.scenario, study.results.manifest.get("seed")
-    if scenario is None or seed is None:
-        return None
-    trial = simulate(scenario, study.shown_run, int(seed))
-    return dead_reckoning(trial.start, trial.controls)[:, :2]
 
 
 def world_map(study: Study) -> tuple[Figure, ...]:

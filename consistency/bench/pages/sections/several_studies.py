@@ -11,7 +11,7 @@ import numpy as np
 
 from consistency.bench.pages.sections.nees import anees_curves
 from consistency.bench.pages.sections.report_input import STEREO, Report, Study, Track
-from consistency.referee.diagnostics.number_words import names_in_a_row, short
+from consistency.referee.diagnostics.number_words import is_or_are, names_in_a_row, short
 from consistency.referee.diagnostics.verdict_parts import STATUSES, Interval
 from consistency.referee.pages.verdicts import judgement, method
 from consistency.referee.pages.write_pages import facts
@@ -83,14 +83,10 @@ def opening(report: Report) -> tuple[Block, ...]:
     if main is not None:
         (curves,) = anees_curves(main)
         question = Text(QUESTION), replace(curves, title=f"NEES over time at a baseline of {_baseline(main)}", level=2)
-    return *question, _origin(report), _picture(report), _table(report)
-
-
-def _origin(report: Report) -> Text:
-    """When and by which command the numbers were made, in one line."""
-    said = dict(facts(report.manifest))
-    parts = [f"{name.lower()}: {said[name]}" for name in ORIGIN if name in said]
-    return Text(f"{'; '.join(parts)}.", lead="Origin.")
+    stated = dict(facts(report.manifest))
+    origin = [f"{name.lower()}: {stated[name]}" for name in ORIGIN if name in stated]
+    origin_line = Text(f"{'; '.join(origin)}.", lead="Origin.")
+    return *question, origin_line, _picture(report), _table(report)
 
 
 def main_sentence(studies: Sequence[Study]) -> str:
@@ -107,7 +103,7 @@ def main_sentence(studies: Sequence[Study]) -> str:
         size = ""
         if known:
             size = f" (x{short(known[0])})" if len(known) == 1 else f" (by x{short(known[0])} to x{short(known[-1])})"
-        parts.append(f"{names_in_a_row(list(ratios))} {'is' if len(ratios) == 1 else 'are'} {status}{size}")
+        parts.append(f"{names_in_a_row(list(ratios))} {is_or_are(len(ratios))} {status}{size}")
     return f"At a baseline of {_baseline(main)}, {'; '.join(parts)}."
 
 

@@ -291,9 +291,17 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     -------
     the run, and (k,) how many times as large its covariances are in the mean over components
     """
-    row, _ = _first(name, p)
+    row, truth = _first(name, p)
     sound = sound_of(p, judged)
-    seen = submatrices(_seen(name, p, row, sound), judged)
+    n = p.own.covariance.shape[-1]
+    free = np.eye(6)
+    if n == 3:
+        free = free[[0, 1, 5]]
+    plain = p.with_values(covariance=np.tile(np.eye(n), (len(p.own.t), 1, 1)))
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
+    of_first = tangent(plain, first, free)[0]
+    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
+    seen = submatrices(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2), judged)
     own = submatrices(p.own.covariance[sound.rows], judged)
     ratio = np.linalg.solve(own, seen)
     size = np.trace(ratio, axis1=1, axis2=2) / len(judged)
@@ -306,21 +314,6 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + mirrored)
     P[row] = 0.0
     return p.with_values(covariance=P), np.square(1.0 + t[sound.rows != row])
-
-
-def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
-    """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
-    n = p.own.covariance.shape[-1]
-    free = np.eye(6)
-    if n == 3:
-        free = free[[0, 1, 5]]
-    alike = np.tile(np.eye(n), (len(p.own.t), 1, 1))
-    plain = p.with_values(covariance=alike)
-    _, truth = _first(name, p)
-    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
-    of_first = tangent(plain, first, free)[0]
-    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
-    return np.asarray(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2))
 
 
 @dataclass(frozen=True)

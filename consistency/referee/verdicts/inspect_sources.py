@@ -403,18 +403,20 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
         with suppress(InputError):
             found = kind.read(path, read_files.checked_options(r), True)
             facts = (*facts, *Attempt(r, {}, found).facts)
+            option, reason = (
+                "--span",
+                "length of the motions that need a covariance: metres, seconds (1s) or steps (10)",
+            )
+            how = "'fit-covariance' finds one for its motions"
+            command = _command("fit-covariance", path, r, ("--span", "1m"))
             rows = _attempt(path, r.with_options(unstated=True, independent=True), {})
             if not rows.refusal and all(map(_is_of_rows, _attempt(path, r.with_options(unstated=True), {}).records)):
-                why.append(
-                    ("--independent", "no correlation of neighbouring rows is found, at a false-alarm rate of 1 %")
-                )
-                note = f"{tried.refusal}; if the estimator has one, write it; 'correct' finds one, judged row by row"
-                note += f". If rows are poses of a drive: {_command('fit-covariance', path, r, ('--span', '1m'))}"
+                option = "--independent"
+                reason = "no correlation of neighbouring rows is found, at a false-alarm rate of 1 %"
+                how = f"'correct' finds one, judged row by row. If rows are poses of a drive: {command}"
                 command = _command("correct", path, r.with_options(independent=True))
-                return Inspection(path, kind.name, facts, (note,), tuple(why), command)
-            why.append(("--span", "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"))
-            note = f"{tried.refusal}; if the estimator has one, write it; 'fit-covariance' finds one for its motions"
-            command = _command("fit-covariance", path, r, ("--span", "1m"))
+            note = f"{tried.refusal}; if the estimator has one, write it; {how}"
+            why.append((option, reason))
             return Inspection(path, kind.name, facts, (note,), tuple(why), command)
     notes = ("by its name it is the truth; inspect the estimates",) if TRUTH.search(path.stem) else ()
     if not tried.found and r.sources.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts
@@ -521,13 +523,18 @@ def _stated(e: Estimator) -> Array:
     return np.concatenate([p.own.covariance[p.own.stated] for p in e.runs])
 
 
+def _usual(variances: Array) -> Array:
+    """Deviations of each component in the median of variances (N, n), (n,)."""
+    return np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
+
+
 def _covariance(e: Estimator) -> Iterator[str]:
     """Median deviations of all components, and components that are not stated or never change."""
     variances = np.diagonal(_stated(e), axis1=1, axis2=2)
     if not len(variances):
         yield "none is stated"
         return
-    usual = np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
+    usual = _usual(variances)
     parts = "matrix" if e.error.stated == WHOLE else "deviations alone" if e.error.stated.alone else "blocks"
     yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.error.axes, usual, strict=True))}"
     same = (variances == variances[0]).all(axis=0)
@@ -552,8 +559,7 @@ def _suspects(e: Estimator) -> Iterator[str]:
             yield f"the covariance of {bad} of {len(P)} rows is not positive definite"
         if (P[0] == P).all():
             yield "the covariance is the same in every row: a number that was set once, rather than a filter's"
-        sigma = np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0)))
-        usual = dict(zip(e.error.axes, sigma, strict=True))
+        usual = dict(zip(e.error.axes, _usual(np.diagonal(P, axis1=1, axis2=2)), strict=True))
         for unit in (("x", "y", "z"), ("roll", "pitch", "yaw"), ("vx", "vy", "vz")):
             of = {usual[axis]: axis for axis in unit if axis in usual and 0 < usual[axis] ** 2 < LARGE}
             if of and max(of) > UNLIKE * min(of):

@@ -778,7 +778,7 @@ def test_many_components_are_fitted_like_few(rng):
     log_det = np.mean([np.linalg.slogdet(P[k])[1] for k in (0, 2, 3)])
     assert found.likelihood == pytest.approx(-0.5 * (np.mean(nees) + log_det), rel=1e-9)
     many = [states(np.ones((1, 400)), np.eye(400))] * 40
-    assert len(thinned(many, 0.0)) == 20
+    assert len(thinned(many)) == 20
 
 
 def assert_named(causes, said):

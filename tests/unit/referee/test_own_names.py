@@ -270,7 +270,7 @@ def test_one_column_states_two_deviations(tmp_path, suffix):
     given = {"sigma_x": "eph", "sigma_y": "eph"}
     files = tmp_path / f"est.{suffix}", tmp_path / f"true.{suffix}"
     if suffix == "txt":
-        sheet = sheet_of(files[0], head_of(files[0], given), given)
+        sheet = sheet_of(head_of(files[0], given))
         assert_allclose(sheet.data["sigma_x"], sigma)
         assert_allclose(sheet.data["sigma_y"], sigma)
         assert set(sheet.data) == {"timestamp_us", "x", "y", "sigma_x", "sigma_y"}

@@ -403,11 +403,8 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
         with suppress(InputError):
             found = kind.read(path, read_files.checked_options(r), True)
             facts = (*facts, *Attempt(r, {}, found).facts)
-            option, reason = (
-                "--span",
-                "length of the motions that need a covariance: metres, seconds (1s) or steps (10)",
-            )
-            how = "'fit-covariance' finds one for its motions"
+            option, how = "--span", "'fit-covariance' finds one for its motions"
+            reason = "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"
             command = _command("fit-covariance", path, r, ("--span", "1m"))
             rows = _attempt(path, r.with_options(unstated=True, independent=True), {})
             if not rows.refusal and all(map(_is_of_rows, _attempt(path, r.with_options(unstated=True), {}).records)):
@@ -523,18 +520,13 @@ def _stated(e: Estimator) -> Array:
     return np.concatenate([p.own.covariance[p.own.stated] for p in e.runs])
 
 
-def _usual(variances: Array) -> Array:
-    """Deviations of each component in the median of variances (N, n), (n,)."""
-    return np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
-
-
 def _covariance(e: Estimator) -> Iterator[str]:
     """Median deviations of all components, and components that are not stated or never change."""
     variances = np.diagonal(_stated(e), axis1=1, axis2=2)
     if not len(variances):
         yield "none is stated"
         return
-    usual = _usual(variances)
+    usual = np.sqrt(np.abs(np.nanmedian(variances, axis=0)))
     parts = "matrix" if e.error.stated == WHOLE else "deviations alone" if e.error.stated.alone else "blocks"
     yield f"{parts}, sigma {', '.join(f'{axis} {s:.2g}' for axis, s in zip(e.error.axes, usual, strict=True))}"
     same = (variances == variances[0]).all(axis=0)
@@ -559,7 +551,8 @@ def _suspects(e: Estimator) -> Iterator[str]:
             yield f"the covariance of {bad} of {len(P)} rows is not positive definite"
         if (P[0] == P).all():
             yield "the covariance is the same in every row: a number that was set once, rather than a filter's"
-        usual = dict(zip(e.error.axes, _usual(np.diagonal(P, axis1=1, axis2=2)), strict=True))
+        sigma = np.sqrt(np.abs(np.nanmedian(np.diagonal(P, axis1=1, axis2=2), axis=0)))
+        usual = dict(zip(e.error.axes, sigma, strict=True))
         for unit in (("x", "y", "z"), ("roll", "pitch", "yaw"), ("vx", "vy", "vz")):
             of = {usual[axis]: axis for axis in unit if axis in usual and 0 < usual[axis] ** 2 < LARGE}
             if of and max(of) > UNLIKE * min(of):

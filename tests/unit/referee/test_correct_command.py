@@ -150,8 +150,7 @@ def test_trajectories_come_back_as_trajectories(columns, apart, turned, tmp_path
     after = np.loadtxt(out / "corrected" / name)
     first = 1 if apart else 8
     assert (after[:, :first] == before[:, :first]).all()
-    rates = {36: 0, 21: 0, 6: 0}
-    place = first + rates[columns] if not turned else first + {36: 21, 21: 15}[columns]
+    place = first + ({36: 21, 21: 15}[columns] if turned else 0)
     of_sigma = 0.5 if columns == 6 else 1.0
     assert after[0, place] / before[0, place] == pytest.approx(factors["position"] ** of_sigma, rel=1e-9)
 

@@ -6,7 +6,7 @@ import hints as world
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from recorded import read_recordings
+from recorded import notes_of, read_recordings
 from records import changed
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -151,21 +151,20 @@ MIXED = {
 }  # fmt: skip
 
 
-BESIDE = ["quaternions", "blocks", "gtsam", "turned world", "information", "headings in degrees"]
+SCALES = {  # of the covariance beside the mix-up, where it is not right
+    **dict.fromkeys(["quaternions", "blocks", "gtsam", "information", "headings in degrees"], (0.25, 4.0)),
+    "turned world": (0.1, 0.25, 4.0, 10.0), "shifted world": (0.1, 1.0, 10.0), "lever arm": (0.1, 1.0, 10.0),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "name, scale", [*((name, 1.0) for name in MIXED), *((name, scale) for name in BESIDE for scale in (0.25, 4.0))]
-)
+@pytest.mark.parametrize("name, scale", [(name, scale) for name in MIXED for scale in SCALES.get(name, (1.0,))])
 def test_a_mix_up_is_named_also_beside_a_wrong_scale(name, scale, rng):
     make, mess, words = MIXED[name]
-    runs = [p.with_values(covariance=p.own.covariance * scale) for p in make(rng)]
-    axes = SIX if runs[0].manifold == "spatial" else THREE
-    (said,) = hints("est", axes, [mess(p) for p in runs])
+    runs = [mess(p.with_values(covariance=p.own.covariance * scale)) for p in make(rng)]
+    (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, runs)
     assert said.startswith("est: the NEES")
     assert words in said
-    rest = {0.25: "too large in all components", 4.0: "too small in all components"}.get(scale)
-    assert rest is None or said.endswith(rest)
+    assert scale == 1.0 or said.endswith(f"too {'large' if scale < 1.0 else 'small'} in all components")
 
 
 def decades(runs):
@@ -178,15 +177,6 @@ def test_worlds_of_each_run_are_named(rng):
     runs = [moved(p, WorldTransform.about_z(0.7 * i, FAR)) for i, p in enumerate(spatial(rng))]
     (said,) = hints("est", SIX, runs)
     assert said.endswith("each run is turned about z and shifted by itself to meet the truth; add --align posyaw")
-
-
-@pytest.mark.parametrize("ratio", [0.2, 1.0, 5.0])
-def test_a_filter_that_is_right_or_wrong_by_itself_gets_no_hint(ratio, rng):
-    for name in ("blocks", "gtsam", "deviations", "shifted world", "planar deviations"):
-        runs = [p.with_values(covariance=p.own.covariance / ratio) for p in MIXED[name][0](rng)]
-        axes = SIX if runs[0].manifold == "spatial" else THREE
-        assert decades(runs)[0] == pytest.approx(np.log10(ratio), abs=0.15)
-        assert hints("est", axes, runs) == []
 
 
 @pytest.mark.parametrize("name, factor", [(name, case[4][-1]) for name, case in world.MIXED.items()])
@@ -357,12 +347,6 @@ def fit(*whitened, P=None):
     return found
 
 
-def test_no_guess_that_fits_is_no_hint(rng):
-    runs = [p.with_values(covariance=p.own.covariance / 1000.0) for p in planar(rng)]
-    assert decades(runs)[0] > 2.5
-    assert hints("est", THREE, runs) == []
-
-
 def test_a_variance_in_the_row_of_another_component_is_no_reason_to_judge_that_one(rng):
     """Yaw moves and has no variance, roll has one and does not move: not --axes x,y,roll, which is conservative."""
     error, P = np.zeros((20, 6)), np.zeros((20, 6, 6))
@@ -520,7 +504,7 @@ TURNED = {
 
 
 @pytest.mark.parametrize("name", list(TURNED))
-@pytest.mark.parametrize("scale", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize("scale", [0.25, 4.0])
 def test_covariances_in_axes_of_the_motion_are_named(name, scale, rng):
     kind, axes, words = TURNED[name]
     sigma = np.array([0.05, 0.4, 0.1, 0.01, 0.01, 0.01] if kind == "spatial" else [0.05, 0.4, 0.1])
@@ -590,16 +574,6 @@ def test_deviations_with_correlations_are_named(sigma, rng):
     (run,) = [world.correlations(states(e, P))]
     (said,) = hints("est", [f"e{k}" for k in range(n)], [run])
     assert "its diagonal holds standard deviations, and correlations are beside them; multiply each" in said
-
-
-@pytest.mark.parametrize("scale", [10.0, 0.1])
-@pytest.mark.parametrize("name", ["turned world", "shifted world", "lever arm"])
-def test_worlds_and_bodies_are_named_beside_a_scale_of_ten(name, scale, rng):
-    make, mess, words = MIXED[name]
-    runs = [mess(p).with_values(covariance=scale * mess(p).own.covariance) for p in make(rng)]
-    (said,) = hints("est", SIX if runs[0].manifold == "spatial" else THREE, runs)
-    assert words in said
-    assert "in all components" in said
 
 
 def test_a_unit_quaternion_with_four_variances_is_named(rng):
@@ -992,16 +966,6 @@ def test_errors_in_the_plane_are_carried_over(convention):
 # --- files ------------------------------------------------------------------------------------------
 
 
-def test_the_hint_is_a_note_of_what_was_read(tmp_path, rng):
-    p = spatial(rng)[0]
-    for name, values in (("est", p.own.estimate), ("truth", p.true.values), ("P", p.own.covariance.reshape(STEPS, 36))):
-        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([p.own.t, values]), fmt="%.17g")
-    files = tmp_path / "est.txt", tmp_path / "truth.txt", tmp_path / "P.txt"
-    wrong = read_recordings(*files, covariance_order="rotation-translation")[0].origin.notes
-    assert any("in the other order (--covariance-order)" in note for note in wrong)
-    assert not any("about right if" in note for note in read_recordings(*files)[0].origin.notes)
-
-
 def trials(rng, runs=20, steps=40):
     """Truth and estimates (runs, steps, 3) of planar poses that turn past pi, and right covariances."""
     sigma = np.array([0.2, 0.3, 0.02])
@@ -1073,7 +1037,7 @@ def test_an_angle_whose_errors_jump_by_a_turn_is_named(wrapped, tmp_path, rng):
     assert jumps == 0 or wrapped
     assert jumps > 2 or not wrapped
     (judged,) = read_recordings(tmp_path / "poses.npz", error="so2")
-    assert not any("2 pi" in note for note in judged.origin.notes)
+    assert "2 pi" not in notes_of(judged)
 
 
 def test_errors_that_are_far_off_by_themselves_are_no_angle(rng):

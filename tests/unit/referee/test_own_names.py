@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from command import consistency
 from numpy.testing import assert_allclose
+from recorded import notes_of
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -92,10 +93,7 @@ def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
     for record in found:
         assert_allclose(record.errors.nees, expected, rtol=1e-6)
     assert np.abs(cs.read(down, enu, error=convention).errors.nees / expected - 1.0).max() > 0.01
-    assert any(
-        "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in n
-        for n in found[0].origin.notes
-    )
+    assert "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in notes_of(found[0])
 
 
 def test_the_additive_error_is_taken_in_the_axes_of_the_estimates(tmp_path):

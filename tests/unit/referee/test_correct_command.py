@@ -16,6 +16,7 @@ import consistency as cs
 from consistency.referee.diagnostics.groups import Groups
 from consistency.referee.fit_covariance.fit_files import place_in, toml
 
+pytestmark = pytest.mark.usefixtures("without_hints")
 RUNS, DRIVES, STEPS = 24, 8, 20
 
 

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.diagnostics import judge
 from consistency.referee.geometry import SPATIAL
-from consistency.referee.readers.mix_ups import hints
+
+pytestmark = pytest.mark.usefixtures("without_hints")
 
 # standard deviations of x, y, z (m) and of the rotation about x, y, z (rad): they differ, so that a frame shows
 SIGMA = np.array([0.02, 0.2, 0.06, 0.01, 0.1, 0.03])
@@ -55,14 +56,6 @@ def _text(p, R):
     return " ".join(f"{x:.15g}" for x in (*p, *R.as_quat()))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def without_hints():
-    """No look for mix-ups, which takes most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hints, "hints", lambda *_: [])
-        yield
-
-
 def read(files, error):
     """The record of files without a look at the clocks."""
     (record,) = read_recordings(*files, error=error, time_offset=0.0)
@@ -70,7 +63,7 @@ def read(files, error):
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def files(tmp_path_factory, without_hints):
     return {convention: write(tmp_path_factory.mktemp(convention), convention) for convention in SPATIAL}
 
 

@@ -241,21 +241,14 @@ def test_only_a_constant_that_is_never_wrong_is_left_out(rng):
     assert not not_estimated([*(0.0 * error)], [*np.ones((2, 6, 4))]).any()  # a file beside itself
 
 
-@pytest.mark.parametrize("variances, remedy", [
-    ((0, 0, 0, 0.0025), ""), ((1e6, 0, 0, 0.0025), ""), ((0.0025, 0, 0, 0), "in the row of its own component"),
-])  # fmt: skip
-def test_a_variance_in_the_wrong_row(variances, remedy, tmp_path):
-    """A zero of what never changes is a dummy; one of a heading that changes is not."""
+@pytest.mark.parametrize("variances", [(0, 0, 0, 0.0025), (1e6, 0, 0, 0.0025)])
+def test_a_variance_of_0_of_what_never_changes_is_a_dummy(variances, tmp_path):
     est, truth = planar(tmp_path, (1, 1, 1))
     for path in est.iterdir():
         rows = np.loadtxt(path)
         rows[:, 8:] = np.diag([0.01, 0.01, *variances]).ravel()
         np.savetxt(path, rows)
-    if not remedy:
-        assert cs.read(est, truth=truth).errors.axes == ("x", "y", "yaw")
-        return
-    with pytest.raises(cs.InputError, match=remedy):
-        cs.read(est, truth=truth)
+    assert cs.read(est, truth=truth).errors.axes == ("x", "y", "yaw")
 
 
 # --- headings in degrees -----------------------------------------------------------------------------

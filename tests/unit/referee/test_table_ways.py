@@ -16,9 +16,7 @@ from consistency.referee.readers.formats.table_columns import stated_state
 P = np.array([[0.04, 0.01], [0.01, 0.09]])
 
 
-@pytest.fixture(autouse=True)
-def inside(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("inside")
 
 
 def save(name, text):

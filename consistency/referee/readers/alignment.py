@@ -148,7 +148,17 @@ def aligned(
         frames = frames_of(name, runs, mode, judged)
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    sizes = _sizes_in_words(name, mode, frames)
+    if len(frames) == 1 or mode.endswith("-all"):
+        x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
+        of = mode
+        turns = f"({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"
+        x, y, z = frames[0].shift
+        shifts = f"({x:.4g}, {y:.4g}, {z:.4g})"
+    else:
+        of = f"{mode}, each of {len(frames)} runs by itself"
+        turns = f"{_span(np.rad2deg([frame.turn.magnitude() for frame in frames]))} degrees"
+        shifts = _span(np.linalg.norm([frame.shift for frame in frames], axis=1))
+    sizes = f"{name}: aligned by {of}: turned by {turns} and shifted by {shifts} m"
     return replace(found, fit=replace(found.fit, align=mode), notes=(sizes, *found.notes))
 
 
@@ -232,23 +242,11 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
     return Aligned(out, TruthFit(caption=caption, reduced=True, unavailable=(*BIAS, "outliers")), (note,))
 
 
-# --- words --------------------------------------------------------------------------------------------------
-
-
-def _sizes_in_words(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
-    if len(frames) == 1 or mode.endswith("-all"):
-        x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
-        turned = f"turned by ({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"
-        x, y, z = frames[0].shift
-        return f"{name}: aligned by {mode}: {turned} and shifted by ({x:.4g}, {y:.4g}, {z:.4g}) m"
-    turns = _span(np.rad2deg([frame.turn.magnitude() for frame in frames]))
-    shifts = _span(np.linalg.norm([frame.shift for frame in frames], axis=1))
-    each = f"each of {len(frames)} runs by itself"
-    return f"{name}: aligned by {mode}, {each}: turned by {turns} degrees and shifted by {shifts} m"
-
-
 def _span(values: Array) -> str:
     return f"{values.min():.3g} to {values.max():.3g} (median {np.median(values):.3g})"
+
+
+# --- frames -------------------------------------------------------------------------------------------------
 
 
 def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:

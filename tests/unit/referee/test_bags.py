@@ -115,6 +115,7 @@ def test_a_robot_in_the_plane_is_judged_in_the_plane(tmp_path, variances, unstat
     assert (f"the variances of {unstated} are 0, -1" in notes_of(r)) == bool(unstated)
 
 
+@pytest.mark.usefixtures("without_hints")
 def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_dummies(tmp_path):
     """An offset of 0.35 s makes an error of 0.3 m and 0.1 rad; without it NEES is 3, of 600: 0.5 is 5 sigma.
 
@@ -171,6 +172,8 @@ def test_the_time_since_a_topic_makes_groups(tmp_path):
     expected = np.where(t < 0.33, np.nan, t - last)
     assert_allclose(r.runs.by[0], expected, atol=1e-6)
     assert len(r.groups.names) == 5
+    [r] = read_recordings(bag, topic="/odom", truth_topic="map:body", by="t")  # since the first row
+    assert_allclose(r.runs.by[0], t - t[0], atol=1e-6)
     found = cs.inspect(bag)
     assert not found.command
     assert any(

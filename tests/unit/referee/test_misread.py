@@ -21,6 +21,7 @@ from consistency.referee.readers.runs_to_record import not_estimated
 from consistency.referee.readers.truth_matching import AXES, REST, make_poses
 from consistency.testing import assert_consistent
 
+pytestmark = pytest.mark.usefixtures("without_hints")
 SURE = 1e-6  # false-alarm rate of a verdict
 
 

@@ -16,6 +16,7 @@ from consistency.referee.readers.formats.file_kinds import head_of
 from consistency.referee.readers.formats.sheet import sheet_of
 from consistency.referee.readers.places import one_of_each_kind
 
+pytestmark = pytest.mark.usefixtures("without_hints")
 STEPS = 6
 NED, FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.diag([1.0, -1.0, -1.0])  # to ENU, to FLU
 CONVENTIONS = ["so3", "so3-body", "left", "right"]

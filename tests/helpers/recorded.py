@@ -8,3 +8,8 @@ def read_recordings(estimates, truth=None, covariance=None, error=None, **option
     return read_files.read_recordings(
         estimates, make_reading(truth=truth, covariance=covariance, error=error, **options)
     )
+
+
+def notes_of(record):
+    """All notes of a record, each on a line."""
+    return "\n".join(record.origin.notes)

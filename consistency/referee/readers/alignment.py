@@ -148,7 +148,17 @@ def aligned(
         frames = frames_of(name, runs, mode, judged)
     there = _moved(runs, frames)
     found = _from_first(name, there, judged) if mode == "origin" else _fitted(name, there, mode, judged)
-    sizes = _sizes_in_words(name, mode, frames)
+    if len(frames) == 1 or mode.endswith("-all"):
+        x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
+        of = mode
+        turns = f"({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"
+        x, y, z = frames[0].shift
+        shifts = f"({x:.4g}, {y:.4g}, {z:.4g})"
+    else:
+        of = f"{mode}, each of {len(frames)} runs by itself"
+        turns = f"{_span(np.rad2deg([frame.turn.magnitude() for frame in frames]))} degrees"
+        shifts = _span(np.linalg.norm([frame.shift for frame in frames], axis=1))
+    sizes = f"{name}: aligned by {of}: turned by {turns} and shifted by {shifts} m"
     return replace(found, fit=replace(found.fit, align=mode), notes=(sizes, *found.notes))
 
 
@@ -232,23 +242,11 @@ def _from_first(name: str, runs: Sequence[Poses], judged: Sequence[int]) -> Alig
     return Aligned(out, TruthFit(caption=caption, reduced=True, unavailable=(*BIAS, "outliers")), (note,))
 
 
-# --- words --------------------------------------------------------------------------------------------------
-
-
-def _sizes_in_words(name: str, mode: str, frames: Sequence[WorldTransform]) -> str:
-    if len(frames) == 1 or mode.endswith("-all"):
-        x, y, z = np.rad2deg(frames[0].turn.as_rotvec())
-        turned = f"turned by ({x:.4g}, {y:.4g}, {z:.4g}) degrees about x, y, z"
-        x, y, z = frames[0].shift
-        return f"{name}: aligned by {mode}: {turned} and shifted by ({x:.4g}, {y:.4g}, {z:.4g}) m"
-    turns = _span(np.rad2deg([frame.turn.magnitude() for frame in frames]))
-    shifts = _span(np.linalg.norm([frame.shift for frame in frames], axis=1))
-    each = f"each of {len(frames)} runs by itself"
-    return f"{name}: aligned by {mode}, {each}: turned by {turns} degrees and shifted by {shifts} m"
-
-
 def _span(values: Array) -> str:
     return f"{values.min():.3g} to {values.max():.3g} (median {np.median(values):.3g})"
+
+
+# --- frames -------------------------------------------------------------------------------------------------
 
 
 def frame_of_first_pose(name: str, p: Poses) -> WorldTransform:
@@ -291,9 +289,17 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     -------
     the run, and (k,) how many times as large its covariances are in the mean over components
     """
-    row, _ = _first(name, p)
+    row, truth = _first(name, p)
     sound = sound_of(p, judged)
-    seen = submatrices(_seen(name, p, row, sound), judged)
+    n = p.own.covariance.shape[-1]
+    free = np.eye(6)
+    if n == 3:
+        free = free[[0, 1, 5]]
+    plain = p.with_values(covariance=np.tile(np.eye(n), (len(p.own.t), 1, 1)))
+    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
+    of_first = tangent(plain, first, free)[0]
+    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
+    seen = submatrices(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2), judged)
     own = submatrices(p.own.covariance[sound.rows], judged)
     ratio = np.linalg.solve(own, seen)
     size = np.trace(ratio, axis1=1, axis2=2) / len(judged)
@@ -306,21 +312,6 @@ def from_first_pose(name: str, p: Poses, judged: Sequence[int]) -> tuple[Poses, 
     P[np.ix_(sound.rows, index, index)] = 0.5 * (bound + mirrored)
     P[row] = 0.0
     return p.with_values(covariance=P), np.square(1.0 + t[sound.rows != row])
-
-
-def _seen(name: str, p: Poses, row: int, sound: Sound) -> Array:
-    """Covariance (k, n, n) of the error that the pose in ``row`` causes in each sound row."""
-    n = p.own.covariance.shape[-1]
-    free = np.eye(6)
-    if n == 3:
-        free = free[[0, 1, 5]]
-    alike = np.tile(np.eye(n), (len(p.own.t), 1, 1))
-    plain = p.with_values(covariance=alike)
-    _, truth = _first(name, p)
-    first = Sound(np.array([row]), truth[None], np.zeros((1, n)), range(n))
-    of_first = tangent(plain, first, free)[0]
-    J = tangent(plain, replace(sound, judged=range(n)), free) @ np.linalg.inv(of_first)
-    return np.asarray(J @ p.own.covariance[row] @ np.swapaxes(J, 1, 2))
 
 
 @dataclass(frozen=True)

@@ -163,6 +163,11 @@ class StatementOptions:
     ensemble: int | None = None
     unstated: bool | None = None  # of no command line: the covariance is I where the files state none
 
+    @property
+    def is_of_bounds(self) -> bool:
+        """Whether bounds are judged as such, and not as the covariance of a Gaussian."""
+        return self.level is not None and not self.gaussian
+
 
 @dataclass(frozen=True, kw_only=True)
 class GroupOptions:

@@ -291,24 +291,19 @@ def longest_start(tracks: Sequence[Track]) -> int:
     """Rows that a start known exactly may take, in which a covariance is singular; 0 where a run begins otherwise."""
     starts = []
     for track in tracks:
-        starts.append((_first_full(track), len(track.column)))
-        if starts[-1][0] == 0 and len(track.column):
+        P = track.covariance
+        start = 0
+        if P is not None and len(P) and classify(P[:1], ROUNDED)[0] != Validity.VALID:
+            start = _first(classify(P, ROUNDED) == Validity.VALID)
+        if start == 0 and len(track.column):
             return 0
+        starts.append((start, len(track.column)))
     ended = [start for start, rows in starts if start < rows]
     if not ended:
         return max((rows for _, rows in starts), default=0)
     if min(start for start, _ in starts) == 0:
         return 0
     return max(ended)
-
-
-def _first_full(track: Track) -> int:
-    """First row with a covariance of full rank; the number of rows without any."""
-    if track.covariance is None or not len(track.column):
-        return 0
-    if classify(track.covariance[:1], ROUNDED)[0] == Validity.VALID:
-        return 0
-    return _first(classify(track.covariance, ROUNDED) == Validity.VALID)
 
 
 def _first(full: Array) -> int:
@@ -572,7 +567,14 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
     InputError
         No window fits, or seconds are asked for and rows have no time.
     """
-    place = _along(t, position, rows, relative, file)
+    place = rows.astype(float)
+    if relative.unit == "s":
+        if not np.isfinite(t[rows]).all():
+            raise InputError(f"{file}: {relative.flag} {relative.option} needs a column t, in s")
+        place = t[rows]
+    elif relative.unit == "m":
+        steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        place = np.append(0.0, np.cumsum(steps))
     first = []
     last = []
     skipped = i = 0
@@ -586,17 +588,6 @@ def windows(t: Array, position: Array, rows: Indices, relative: Relative, file: 
     if not first:
         raise InputError(_none(place, relative, file))
     return np.array(first, np.int64), np.array(last, np.int64), skipped
-
-
-def _along(t: Array, position: Array, rows: Indices, relative: Relative, file: str) -> Array:
-    if relative.unit == "step":
-        return rows.astype(float)
-    if relative.unit == "s":
-        if not np.isfinite(t[rows]).all():
-            raise InputError(f"{file}: {relative.flag} {relative.option} needs a column t, in s")
-        return t[rows]
-    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    return np.append(0.0, np.cumsum(steps))
 
 
 def _none(place: Array, relative: Relative, file: str) -> str:

@@ -399,18 +399,17 @@ def _refused(path: Path, kind: read_files.Kind, facts: Pairs, tried: Attempt) ->
         with suppress(InputError):
             found = kind.read(path, read_files.checked_options(r), True)
             facts = (*facts, *Attempt(r, {}, found).facts)
+            option, how = "--span", "'fit-covariance' finds one for its motions"
+            reason = "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"
+            command = _command("fit-covariance", path, r, ("--span", "1m"))
             rows = _attempt(path, r.with_options(unstated=True, independent=True), {})
             if not rows.refusal and all(map(_is_of_rows, _attempt(path, r.with_options(unstated=True), {}).records)):
-                why.append(
-                    ("--independent", "no correlation of neighbouring rows is found, at a false-alarm rate of 1 %")
-                )
-                note = f"{tried.refusal}; if the estimator has one, write it; 'correct' finds one, judged row by row"
-                note += f". If rows are poses of a drive: {_command('fit-covariance', path, r, ('--span', '1m'))}"
+                option = "--independent"
+                reason = "no correlation of neighbouring rows is found, at a false-alarm rate of 1 %"
+                how = f"'correct' finds one, judged row by row. If rows are poses of a drive: {command}"
                 command = _command("correct", path, r.with_options(independent=True))
-                return Inspection(path, kind.name, facts, (note,), tuple(why), command)
-            why.append(("--span", "length of the motions that need a covariance: metres, seconds (1s) or steps (10)"))
-            note = f"{tried.refusal}; if the estimator has one, write it; 'fit-covariance' finds one for its motions"
-            command = _command("fit-covariance", path, r, ("--span", "1m"))
+            note = f"{tried.refusal}; if the estimator has one, write it; {how}"
+            why.append((option, reason))
             return Inspection(path, kind.name, facts, (note,), tuple(why), command)
     notes = ("by its name it is the truth; inspect the estimates",) if TRUTH.search(path.stem) else ()
     if not tried.found and r.sources.truth is None and not file_kinds.is_bag(path):  # beside itself, for the facts

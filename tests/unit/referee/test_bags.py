@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from command import consistency, refused
 from numpy.testing import assert_allclose
-from recorded import read_recordings
+from recorded import notes_of, read_recordings
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -41,6 +41,12 @@ class Drive:
         self.error, self.P = e, P
 
 
+def read_poses(folder, drive):
+    """The record of a drive whose bag has poses of ROS 1."""
+    [record] = read_recordings(write(folder / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
+    return record
+
+
 @pytest.mark.parametrize("ros", [1, 2])
 @pytest.mark.parametrize("kind, topic, truth", [("pose", "/pose", "/vicon"), ("odometry", "/odom", "map:body")])
 def test_a_bag_is_read_to_the_last_digits(tmp_path, ros, kind, topic, truth):
@@ -52,14 +58,9 @@ def test_a_bag_is_read_to_the_last_digits(tmp_path, ros, kind, topic, truth):
     assert_allclose(r.runs.t, START + drive.t)  # the stamps, not the times of writing
     assert r.errors.convention == "so3"
     [alone] = read_recordings(bag, truth_topic=truth)  # one topic has covariances
-    assert np.array_equal(alone.errors.error, r.errors.error)  # type: ignore[arg-type]
-
-
-def test_one_command_from_bag_to_picture(tmp_path, capsys):
-    bag = write(tmp_path / "drive.bag", 1, "pose", Drive())
-    out, _ = consistency(capsys, "analyse", bag, "--truth-topic", "/vicon", "--report", tmp_path / "out")
-    assert "drive is " in out
-    assert "Errors and stated bounds" in (tmp_path / "out" / "report.html").read_text()
+    assert np.array_equal(alone.errors.error, r.errors.error)
+    assert ("the body is 'base' on /odom, but 'body' on map:body" in notes_of(r)) == (kind == "odometry")
+    assert "the world is" not in notes_of(r)
 
 
 def test_what_the_monitor_needs_is_no_bag(tmp_path, capsys):
@@ -107,49 +108,42 @@ def test_a_robot_in_the_plane_is_judged_in_the_plane(tmp_path, variances, unstat
     )
     drive.own[:, 3:] = turn.as_quat()
     drive.P = np.diag([0.01, 0.04, *variances, 9e-4])
-    [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
+    r = read_poses(tmp_path, drive)
     assert r.errors.axes == ("x", "y", "yaw")
     left = "roll, pitch" if unstated else "z, roll, pitch"
-    assert any(f"{left} are not estimated and left out" in note for note in r.origin.notes)
-    assert any(f"the variances of {unstated} are 0, -1" in note for note in r.origin.notes) == bool(unstated)
+    assert f"{left} are not estimated and left out" in notes_of(r)
+    assert (f"the variances of {unstated} are 0, -1" in notes_of(r)) == bool(unstated)
 
 
-def planar_bags(folder, dummies, *, late=0.0, count=4):
-    """Drives in the plane whose truth is 0.05 m lower and ``late`` s late; variances of z, roll, pitch are dummies."""
-    folder.mkdir()
-    for seed in range(count):
+@pytest.mark.usefixtures("without_hints")
+def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_dummies(tmp_path):
+    """An offset of 0.35 s makes an error of 0.3 m and 0.1 rad; without it NEES is 3, of 600: 0.5 is 5 sigma.
+
+    The truth is 0.05 m lower, too; variances of z, roll and pitch are not stated, or are any number.
+    """
+    for seed in range(4):
         drive = Drive(seed)
         e = drive.error * [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
         true = Rotation.from_quat(drive.true[: 5 * STEPS : 5, 3:])
         drive.true[:, 2] = -0.05
         drive.own[:, :3] = drive.true[: 5 * STEPS : 5, :3] - e[:, :3] + [0.0, 0.0, 0.05]
         drive.own[:, 3:] = (Rotation.from_rotvec(-e[:, 3:]) * true).as_quat()
-        drive.P = np.diag([*SIGMA[:2] ** 2, *dummies, SIGMA[5] ** 2])
-        drive.true_t = drive.true_t + late
-        write(folder / f"{seed}.bag", 1, "pose", drive)
-    return folder
-
-
-@pytest.mark.parametrize("dummies", [(1e-6,) * 3, (0.0, 1e6, 1e6)])
-def test_a_robot_in_the_plane_and_its_late_clock_are_found_beside_any_dummy(tmp_path, dummies):
-    """An offset of 0.35 s makes an error of 0.3 m and 0.1 rad; without it NEES is 3, of 600: 0.5 is 5 sigma."""
-    bags = planar_bags(tmp_path / "bags", dummies, late=0.35)
-    [late] = read_recordings(bags, truth_topic="/vicon")
+        drive.P = np.diag([*SIGMA[:2] ** 2, 0.0, 1e6, 1e6, SIGMA[5] ** 2])
+        drive.true_t = drive.true_t + 0.35
+        write(tmp_path / f"{seed}.bag", 1, "pose", drive)
+    [late] = read_recordings(tmp_path, truth_topic="/vicon")
     assert late.errors.axes == ("x", "y", "yaw")
-    notes = " ".join(late.origin.notes)
-    assert "by --axes x,y,yaw" in notes
-    offset = float(notes.split("--time-offset ")[1].split()[0])
+    assert "by --axes x,y,yaw" in notes_of(late)
+    offset = float(notes_of(late).split("--time-offset ")[1].split()[0])
     assert offset == pytest.approx(0.35, abs=0.01)
-    [right] = read_recordings(bags, truth_topic="/vicon", time_offset=offset)
-    [found] = read_recordings(bags, truth_topic="/vicon", time_offset="estimate", axes=["x", "y", "yaw"])
-    for record in (right, found):
-        assert record.errors.axes == ("x", "y", "yaw")
-        assert 2.5 < np.nanmean(record.errors.nees) < 3.5
+    [right] = read_recordings(tmp_path, truth_topic="/vicon", time_offset=offset)
+    assert right.errors.axes == ("x", "y", "yaw")
+    assert 2.5 < np.nanmean(right.errors.nees) < 3.5
 
 
 @pytest.mark.parametrize("name", ["speed", "turn_rate", "linear_y", "angular_z"])
 def test_the_twist_of_odometry_makes_groups(tmp_path, name):
-    """Of two messages with one stamp the first counts, with its own twist."""
+    """Of two messages with one stamp the first counts, with its own pose and twist."""
     drive = Drive()
     drive.twist = np.random.default_rng().normal(size=(STEPS, 6))
     drive.t = drive.t.copy()
@@ -164,6 +158,7 @@ def test_the_twist_of_odometry_makes_groups(tmp_path, name):
         "angular_z": angular[:, 2],
     }
     assert_allclose(r.runs.by[0], expected[name], rtol=1e-12)
+    assert_allclose(r.errors.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
     assert len(r.groups.names) == 5
 
 
@@ -177,6 +172,8 @@ def test_the_time_since_a_topic_makes_groups(tmp_path):
     expected = np.where(t < 0.33, np.nan, t - last)
     assert_allclose(r.runs.by[0], expected, atol=1e-6)
     assert len(r.groups.names) == 5
+    [r] = read_recordings(bag, topic="/odom", truth_topic="map:body", by="t")  # since the first row
+    assert_allclose(r.runs.by[0], t - t[0], atol=1e-6)
     found = cs.inspect(bag)
     assert not found.command
     assert any(
@@ -197,21 +194,6 @@ def test_a_column_that_a_bag_does_not_hold(tmp_path):
         bag = write(tmp_path / kind, 2, kind, Drive())
         with pytest.raises(InputError, match=rf"--by v: .*{kind}.*{said}"):
             read_recordings(bag, truth_topic=truth, by="v")
-
-
-def test_the_time_since_the_first_row_makes_groups(tmp_path):
-    drive = Drive()
-    bag = write(tmp_path / "drive", 2, "odometry", drive)
-    [r] = read_recordings(bag, truth_topic="map:body", by="t")
-    assert_allclose(r.runs.by[0], drive.t - drive.t[0], atol=1e-6)
-
-
-def test_of_two_messages_with_one_stamp_the_first_counts(tmp_path):
-    drive = Drive()
-    drive.t = drive.t.copy()
-    drive.t[5] = drive.t[4]
-    [r] = read_recordings(write(tmp_path / "drive.bag", 1, "pose", drive), truth_topic="/vicon")
-    assert_allclose(r.errors.error[0], np.delete(drive.error, 5, axis=0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -283,6 +265,7 @@ def test_a_file_of_ros_2_without_its_metadata(tmp_path, suffix):
 def test_fixes_against_fixes(tmp_path):
     """NEES in the plane of the first true place; without a fix a message does not count."""
     from test_fixes import flight, plane
+    from test_layouts import nees_of
 
     from consistency.referee.readers.formats.positions import axes_at
 
@@ -293,14 +276,10 @@ def test_fixes_against_fixes(tmp_path):
     kept = np.delete(np.arange(len(place)), 1)
     e = (plane(place, place[0]) - plane(off, place[0]))[kept]
     turns = axes_at(place[0]) @ np.swapaxes(axes_at(off[kept]), 1, 2)
-    stated = turns @ C[kept] @ np.swapaxes(turns, 1, 2)
-    nees = [each @ np.linalg.solve(M, each) for each, M in zip(e, stated, strict=True)]
-    assert_allclose(r.errors.nees[0], nees, rtol=1e-6, atol=1e-6)  # metres are differences of millions of them
-    assert any("/fix read as positions by satellite, 11 of 12 messages with a fix" in note for note in r.origin.notes)
-    assert any(
-        "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in note
-        for note in r.origin.notes
-    )
+    expected = nees_of(e, turns @ C[kept] @ np.swapaxes(turns, 1, 2))
+    assert_allclose(r.errors.nees[0], expected, rtol=1e-6, atol=1e-6)  # metres are differences of millions of them
+    assert "/fix read as positions by satellite, 11 of 12 messages with a fix" in notes_of(r)
+    assert "the body is 'base' on /fix, but 'gps' on /rtk; the poses must be of one body" in notes_of(r)
 
 
 def test_the_type_of_a_covariance_counts(tmp_path):
@@ -322,18 +301,11 @@ def test_blocks_that_are_not_stated_are_not_judged(tmp_path, value):
     drive = Drive()
     drive.P = P.copy()
     drive.P[3:, 3:] = value * np.eye(3)
-    bag = write(tmp_path / "a.bag", 1, "pose", drive)
-    [r] = read_recordings(bag, truth_topic="/vicon")
+    r = read_poses(tmp_path, drive)
     assert r.errors.axes == ("x", "y", "z")
     assert_allclose(r.errors.nees[0], (drive.error[:, :3] ** 2 / SIGMA[:3] ** 2).sum(axis=1), rtol=1e-6)
     said = "the variances of roll,pitch,yaw are 0, -1 or 1e+09 in every message, so not stated and not judged"
-    assert any(said in note for note in r.origin.notes)
-
-
-def test_other_frames_are_named(tmp_path):
-    [r] = read_recordings(write(tmp_path / "a.bag", 1, "odometry", Drive()), truth_topic="map:body")
-    assert any("the body is 'base' on /odom, but 'body' on map:body" in note for note in r.origin.notes)
-    assert not any("the world is" in note for note in r.origin.notes)
+    assert said in notes_of(r)
 
 
 def test_the_covariance_of_a_true_message(tmp_path):

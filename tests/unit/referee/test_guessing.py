@@ -11,18 +11,19 @@ from scipy.spatial.transform import Rotation
 import consistency as cs
 from consistency.diagnostics import judge
 from consistency.referee.geometry import SPATIAL
-from consistency.referee.readers.mix_ups import hints
+
+pytestmark = pytest.mark.usefixtures("without_hints")
 
 # standard deviations of x, y, z (m) and of the rotation about x, y, z (rad): they differ, so that a frame shows
 SIGMA = np.array([0.02, 0.2, 0.06, 0.01, 0.1, 0.03])
 
 
 def write(folder, convention, runs=40, factor=1.0, key=1):
-    """Poses whose errors have the covariance diag(SIGMA^2) in a convention, to first order; ``factor`` on it."""
+    """Poses whose errors have a hundredth of diag(SIGMA^2) in a convention, to first order; ``factor`` on it."""
     rng, est, truth = np.random.default_rng(key), folder / "est", folder / "truth"
     est.mkdir()
     truth.mkdir()
-    numbers = " ".join(f"{x:.12g}" for x in (np.diag(SIGMA**2)).ravel())
+    numbers = " ".join(f"{x:.12g}" for x in 0.01 * np.diag(SIGMA**2).ravel())
     for run in range(runs):
         lines = [[], []]
         for k in range(3):
@@ -32,13 +33,8 @@ def write(folder, convention, runs=40, factor=1.0, key=1):
             lines[0].append(f"{k} {_text(p, R)} {numbers}")
             lines[1].append(f"{k} {_text(true_p, true_R)}")
         for each, text in zip((est, truth), lines, strict=True):
-            (each / f"r{run:02d}.txt").write_text("\n".join(text).replace(numbers, small(numbers)) + "\n")
+            (each / f"r{run:02d}.txt").write_text("\n".join(text) + "\n")
     return est, truth
-
-
-def small(numbers):
-    """A hundredth of the covariance, so that rotations are small."""
-    return " ".join(f"{float(x) / 100.0:.12g}" for x in numbers.split())
 
 
 def applied(p, R, e, convention):
@@ -61,15 +57,13 @@ def _text(p, R):
 
 
 def read(files, error):
-    """The record of files without a look at the clocks and for mix-ups, which take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hints, "hints", lambda *_: [])
-        (record,) = read_recordings(*files, error=error, time_offset=0.0)
+    """The record of files without a look at the clocks."""
+    (record,) = read_recordings(*files, error=error, time_offset=0.0)
     return record
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def files(tmp_path_factory, without_hints):
     return {convention: write(tmp_path_factory.mktemp(convention), convention) for convention in SPATIAL}
 
 
@@ -110,8 +104,7 @@ def test_the_declared_error_has_its_own_status_and_intervals_hold_together(files
 
 
 def test_none_fits(tmp_path):
-    (guess,) = read_recordings(*write(tmp_path, "left", runs=15, factor=9.0), error="guess")
-    v = judge(guess)
+    v = judge(read(write(tmp_path, "left", runs=15, factor=9.0), "guess"))
     assert v.status == "undecided"
     assert "at a rate of 5 % each all are rejected: so3, so3-body, left, right, rvec, euler" in v.reasons[0]
     assert len([line for line in v.reasons if line.startswith("if the error is ")]) == len(SPATIAL)

@@ -20,9 +20,7 @@ V = np.array([[0.3, -0.2], [0.1, 0.4], [-0.6, 0.0]])
 S = np.array([[0.09, 0.02], [0.02, 0.16]])
 
 
-@pytest.fixture(autouse=True)
-def inside(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("inside")
 
 
 def write(name, header, *columns):

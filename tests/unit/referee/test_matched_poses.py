@@ -154,13 +154,13 @@ def test_only_what_is_matched_and_stated_is_judged(rng):
 
 def test_errors_that_fit_are_plausible_and_others_are_not(rng):
     right = [run_of(rng, 200, run) for run in range(10)]
-    assert is_plausible(right, 0.0, range(3))
-    assert not is_plausible([run_of(rng, 200, error=4.0 * SIGMA)], 0.0, range(3))
-    assert not is_plausible([p.with_values(covariance=np.sqrt(p.own.covariance)) for p in right], 0.0, range(3))
-    assert not is_plausible([run_of(rng, error=0.0 * SIGMA)], 0.0, range(3))
+    assert is_plausible(right, range(3))
+    assert not is_plausible([run_of(rng, 200, error=4.0 * SIGMA)], range(3))
+    assert not is_plausible([p.with_values(covariance=np.sqrt(p.own.covariance)) for p in right], range(3))
+    assert not is_plausible([run_of(rng, error=0.0 * SIGMA)], range(3))
     half = [p.with_values(estimate=p.own.estimate * [1.0, 1.0, 57.3]) for p in right]
-    assert is_plausible(half, 0.0, [0, 1])
-    assert not is_plausible(half, 0.0, range(3))
+    assert is_plausible(half, [0, 1])
+    assert not is_plausible(half, range(3))
 
 
 def test_a_start_that_is_known_exactly_is_no_estimate(rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from recorded import read_recordings
+from recorded import notes_of, read_recordings
 from scipy import stats
 
 import consistency as cs
@@ -314,7 +314,7 @@ def test_tables_are_read_with_an_offset(tables):
     for option, right in ((None, False), (0.1, True), ("estimate", True), (-0.1, False)):
         [record] = read_recordings(*files, time_offset=option)
         assert (2.5 < np.nanmean(record.errors.nees) < 3.5) == right, option
-    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].origin.notes)
+    assert "--time-offset 0." in notes_of(read_recordings(*files)[0])
     assert cs.judge(cs.read(*files, time_offset=0.1)).status != "overconfident"
 
 
@@ -336,7 +336,7 @@ def test_trajectories_are_read_with_an_offset(tmp_path, rng):
     early, right = (np.nanmean(read_recordings(*files, time_offset=o)[0].errors.nees) for o in (None, "estimate"))  # type: ignore[arg-type]
     assert early > 6.8
     assert 5.0 < right < 6.8
-    assert any("--time-offset 0." in note for note in read_recordings(*files)[0].origin.notes)
+    assert "--time-offset 0." in notes_of(read_recordings(*files)[0])
 
 
 def test_what_has_truth_is_judged_at_every_offset(rng):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from command import consistency
 from numpy.testing import assert_allclose
+from recorded import notes_of
 from scipy.spatial.transform import Rotation
 
 import consistency as cs
@@ -15,6 +16,7 @@ from consistency.referee.readers.formats.file_kinds import head_of
 from consistency.referee.readers.formats.sheet import sheet_of
 from consistency.referee.readers.places import one_of_each_kind
 
+pytestmark = pytest.mark.usefixtures("without_hints")
 STEPS = 6
 NED, FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.diag([1.0, -1.0, -1.0])  # to ENU, to FLU
 CONVENTIONS = ["so3", "so3-body", "left", "right"]
@@ -71,7 +73,7 @@ def with_covariance(path, own, P):
     return table(path, names, own, P.reshape(len(P), -1))
 
 
-@pytest.mark.parametrize("k", [0, 3, 9])
+@pytest.mark.parametrize("k", [0, 9])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
     own, true, P = states(k)
@@ -92,10 +94,7 @@ def test_the_nees_is_that_in_other_axes(convention, k, tmp_path):
     for record in found:
         assert_allclose(record.errors.nees, expected, rtol=1e-6)
     assert np.abs(cs.read(down, enu, error=convention).errors.nees / expected - 1.0).max() > 0.01
-    assert any(
-        "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in n
-        for n in found[0].origin.notes
-    )
+    assert "the truth, in enu and flu, is read in the axes of the estimates, ned and frd" in notes_of(found[0])
 
 
 def test_the_additive_error_is_taken_in_the_axes_of_the_estimates(tmp_path):
@@ -270,7 +269,7 @@ def test_one_column_states_two_deviations(tmp_path, suffix):
     given = {"sigma_x": "eph", "sigma_y": "eph"}
     files = tmp_path / f"est.{suffix}", tmp_path / f"true.{suffix}"
     if suffix == "txt":
-        sheet = sheet_of(files[0], head_of(files[0], given), given)
+        sheet = sheet_of(head_of(files[0], given))
         assert_allclose(sheet.data["sigma_x"], sigma)
         assert_allclose(sheet.data["sigma_y"], sigma)
         assert set(sheet.data) == {"timestamp_us", "x", "y", "sigma_x", "sigma_y"}

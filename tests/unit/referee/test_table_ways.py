@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from command import consistency
 from numpy.testing import assert_allclose
+from recorded import notes_of
 
 import consistency as cs
 from consistency.referee.readers.formats.sheet import seconds_of_date
@@ -15,9 +16,7 @@ from consistency.referee.readers.formats.table_columns import stated_state
 P = np.array([[0.04, 0.01], [0.01, 0.09]])
 
 
-@pytest.fixture(autouse=True)
-def inside(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("inside")
 
 
 def save(name, text):
@@ -95,14 +94,14 @@ def test_rows_are_paired_by_a_name(name):
     assert record.errors.error.shape == (3, 1, 2)
     assert_allclose(record.errors.error[:, 0, 0], [-0.1, -0.2, -0.3])
     assert_allclose(record.errors.nees[:, 0], [0.01, 0.01, 0.09])
-    assert any(f"rows are paired by '{name}', and each is a run" in note for note in record.origin.notes)
+    assert f"rows are paired by '{name}', and each is a run" in notes_of(record)
 
 
 def test_names_without_a_truth_are_left_out_and_named():
     est = save("est.csv", "image,a,P_a_a\np.png,1.5,1\nx.png,2,1\nq.png,2.5,1\n")
     record = cs.read(est, truth=save("truth.csv", "image,a\nq.png,2\np.png,1\n"), state=["a"])
     assert_allclose(record.errors.error[:, 0, 0], [-0.5, -0.5])
-    assert any("1 have no truth and are left out (x.png)" in note for note in record.origin.notes)
+    assert "1 have no truth and are left out (x.png)" in notes_of(record)
     with pytest.raises(cs.InputError, match=r"truth\.csv: no 'image' of est\.csv is in it, whose first is 'p\.png'"):
         cs.read(est, truth=save("truth.csv", "image,a\nu.png,2\n"), state=["a"])
 
@@ -181,7 +180,7 @@ def test_a_covariance_of_the_truth_that_is_not_used_is_named(header, row, noted)
     assert all("--truth-covariance columns" in note for note in said)
     if noted and "P_a_b" in header:
         used = cs.read("est.csv", truth="truth.csv", state=["a", "b"], truth_covariance="columns")
-        assert not any("counts as 0" in note for note in used.origin.notes)
+        assert "counts as 0" not in notes_of(used)
 
 
 # --- the truth in the folder of a run --------------------------------------------------------------------

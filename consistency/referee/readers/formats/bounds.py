@@ -139,7 +139,7 @@ def require_bound_options(r: Reading) -> None:
     if stated.level is not None:
         levels_of(stated.level)
     alert_limits(stated.alert_limit)
-    if stated.level is not None and not stated.gaussian:
+    if stated.is_of_bounds:
         others = ("relative", "align", "split", "truth_covariance", "truth_errors", "truth_shared", "axes")
         r.refuse("--level", dict.fromkeys(others, ", which is for covariances"))
 
@@ -214,17 +214,16 @@ def stated_in(sheet: TableRows, axes: Sequence[str], options: StatementOptions) 
             if component not in axes:
                 raise InputError(f"{sheet.path}: {one.name} bounds '{component}', which is not in the state "
                                  f"{','.join(axes)}; --state names another")  # fmt: skip
-        values[:, k] = _of_interval(sheet, one) if len(one.columns) == 2 else _of_bound(sheet, one)
+        values[:, k] = _distances(sheet, one)
     return _stated(names, [one.components for one in found], axes, options), values
 
 
-def _of_bound(sheet: TableRows, one: BoundColumns) -> Array:
-    size = sheet.numbers(one.columns[0])
-    refuse(size < 0.0, sheet.place, lambda row: f"{one.name} is negative, {size[row]:g}")
-    return np.stack([size, size], axis=-1)
-
-
-def _of_interval(sheet: TableRows, one: BoundColumns) -> Array:
+def _distances(sheet: TableRows, one: BoundColumns) -> Array:
+    """Distance from the estimate to the lower and the upper end of a bound in each row, (N, 2)."""
+    if len(one.columns) == 1:
+        size = sheet.numbers(one.columns[0])
+        refuse(size < 0.0, sheet.place, lambda row: f"{one.name} is negative, {size[row]:g}")
+        return np.stack([size, size], axis=-1)
     low, high = map(sheet.numbers, one.columns)
     x = sheet.numbers(one.components[0])
     lower, upper = one.columns

@@ -82,22 +82,22 @@ def is_spatial(path: Path, columns: Columns | None = None) -> bool:
 
 def are_poses(path: Path, head: Head | None) -> bool:
     """Whether a text file is of poses in space: by the names of its columns, or without names."""
-    return begins_with_numbers(path) if head is None else _are_in_space(head.names, path)
+    return begins_with_numbers(path) if head is None else _are_in_space(head)
 
 
-def _are_in_space(names: Sequence[str], path: Path) -> bool:
-    found = pose_columns(names, path)
-    return "heading" not in names and found is not None and bool(found.quaternion)
+def _are_in_space(head: Head) -> bool:
+    found = pose_columns(head.names, head.path)
+    return "heading" not in head.names and found is not None and bool(found.quaternion)
 
 
 def is_plane(path: Path, columns: Columns | None = None) -> bool:
     """Whether a file has columns of planar poses, or of speeds and turn rates, under names of their own."""
-    return are_planar(path, head_of(path, columns))
+    return are_planar(head_of(path, columns))
 
 
-def are_planar(path: Path, head: Head | None) -> bool:
+def are_planar(head: Head | None) -> bool:
     """Whether a text file with such a head is of planar poses, or of speeds and turn rates."""
-    if head is None or clock_of(head.names) is None or _are_in_space(head.names, path):
+    if head is None or clock_of(head.names) is None or _are_in_space(head):
         return False
     return len(state_columns(head.names, POSE, PLAIN)) == len(POSE) or bool(rates_in(head.names))
 
@@ -198,6 +198,7 @@ def unknown_kind(path: Path, known: Sequence[str] = SUFFIXES, arrays: str = ARRA
 class Head(NamedTuple):
     """Names of the columns of a text file, as they stand in it."""
 
+    path: Path
     names: list[str]
     line: int  # of the names, from 1
     comment: bool  # it begins with #
@@ -229,7 +230,7 @@ def head_of(path: Path, columns: Columns | None = None) -> Head | None:
         return None
     is_spaced = not any(mark in line for mark in ",;\t")
     known, places = zip(*renamed(names, columns, path), strict=True)
-    return Head(list(known), number, comment, is_spaced, places, columns)
+    return Head(path, list(known), number, comment, is_spaced, places, columns)
 
 
 def begins_with_numbers(path: Path) -> bool:
@@ -252,23 +253,22 @@ def beginning(path: Path) -> bytes:
 
 
 def _beginning(path: Path) -> tuple[list[tuple[int, str]], str | None]:
-    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none."""
+    """Lines with their numbers that stand above the first row of numbers, and this row; None where there is none.
+
+    At least half of the fields of a row are numbers or empty, and one is a number.
+    """
     text = beginning(path).decode("utf-8-sig", "ignore")
     lines: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
-        if _is_row(line):
+        fields = fields_of(line)
+        numbers = sum(map(_is_number, fields))
+        are_enough = numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
+        if are_enough and not _is_comment(line):
             return lines, line
         lines.append((number, line))
     return lines, None
-
-
-def _is_row(line: str) -> bool:
-    """Whether at least half of the fields of a line are numbers or empty, and one is a number."""
-    fields = fields_of(line)
-    numbers = sum(map(_is_number, fields))
-    return not _is_comment(line) and numbers > 0 and 2 * (numbers + fields.count("")) >= len(fields)
 
 
 def _is_comment(line: str) -> bool:
@@ -283,9 +283,14 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def separator_of(line: str) -> str:
+    """What separates the fields of a line: a comma, a semicolon or a tab."""
+    return max(",;\t", key=line.count)
+
+
 def fields_of(line: str) -> list[str]:
     """Fields of a line, apart by commas, semicolons or tabs, or by white space where it has none of them."""
-    separator = max(",;\t", key=line.count)
+    separator = separator_of(line)
     fields = line.split()
     if separator in line:
         fields = line.split(separator)

@@ -417,15 +417,11 @@ class _Log:
             DFReader_binary(str(path)) as log,
         ):
             while (message := log.recv_match(type=[*self.rows, "PARM"])) is not None:
-                self._keep(message.get_type(), message.to_dict())
-
-    def _keep(self, kind: str, fields: dict[str, Any]) -> None:
-        if kind in self.rows:
-            self.rows[kind].append(fields)
-        elif str(fields["Name"]).endswith("_I_GATE"):
-            name = fields["Name"]
-            value = float(fields["Value"])
-            self.gates[name] = min(value, self.gates.get(name, np.inf))
+                fields = message.to_dict()
+                if message.get_type() in self.rows:
+                    self.rows[message.get_type()].append(fields)
+                elif (name := str(fields["Name"])).endswith("_I_GATE"):
+                    self.gates[name] = min(float(fields["Value"]), self.gates.get(name, np.inf))
 
     def gate(self, prefix: str, names: Iterable[str]) -> float:
         """The smallest of some gates, sigma; NaN where none is known."""

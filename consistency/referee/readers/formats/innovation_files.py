@@ -202,7 +202,10 @@ def stream_nis(lines: Iterable[str], name: str, r: Reading = DEFAULT) -> Iterato
         fields = table.row(number, text)
         if fields is None:
             empty = TableRows(table.path, dict.fromkeys(table.names, np.empty(0)), np.empty(0, int), "line")
-            _require_one_run(name, list(with_nis(empty.renamed(r.components.columns), r.statement.dof)[0].data))
+            empty, _ = with_nis(empty.renamed(r.components.columns), r.statement.dof)
+            _require_columns(name, list(empty.data))
+            for several in empty.among(("run", "filter")):
+                raise InputError(f"{name}: column '{several}': lines as they come must be of one run of one filter")
             continue
         row = TableRows(table.path, table.part([fields], [number]), np.array([number]), "line")
         row, _ = with_nis(row.renamed(r.components.columns), r.statement.dof)
@@ -215,10 +218,3 @@ def stream_nis(lines: Iterable[str], name: str, r: Reading = DEFAULT) -> Iterato
         yield row.place(0), nis, dof
     if not table.names:
         raise InputError(f"{name}: is empty; its first line must name the columns, nis and nis_dof among them")
-
-
-def _require_one_run(name: str, columns: Sequence[str]) -> None:
-    _require_columns(name, columns)
-    for several in ("run", "filter"):
-        if several in columns:
-            raise InputError(f"{name}: column '{several}': lines as they come must be of one run of one filter")

@@ -151,7 +151,17 @@ def drive_poses(folder: Path, body: str) -> tuple[Array, Array]:
     attitude = Rotation.from_euler("ZYX", packets[:, [5, 4, 3]])  # Rz(yaw) Ry(pitch) Rx(roll)
     poses[:, :3, :3] = attitude.as_matrix()
     poses[:, :3, 3] = mercator(packets[:, :3])
-    return stamps, poses @ np.linalg.inv(_mount(folder, body))
+    mount = np.eye(4)  # takes points of the inertial unit to the body
+    for name in BODIES[body]:
+        path = place_of(folder, f"calib_{name}.txt")
+        if path is None:
+            raise InputError(f"{folder}: --body needs calib_{name}.txt, here or in the folder above")
+        rows = read_keys(path)
+        part = np.eye(4)
+        part[:3, :3] = turn(path, rows, "R")
+        part[:3, 3] = numbers(path, rows, "T", (3,))
+        mount = part @ mount
+    return stamps, poses @ np.linalg.inv(mount)
 
 
 def drive_sheet(folder: Path, body: str | None = None) -> TableRows:
@@ -182,18 +192,3 @@ def _packet(path: Path) -> list[float]:
     if not (is_place and np.isfinite(values[:6]).all()):
         raise InputError(f"{path}: begins with {fields[0]} {fields[1]}; should be latitude and longitude in degrees")
     return values[:6]
-
-
-def _mount(folder: Path, body: str) -> Array:
-    """Matrix (4, 4) that takes points of the inertial unit to the body, of the lines R and T of calibration files."""
-    mount = np.eye(4)
-    for name in BODIES[body]:
-        path = place_of(folder, f"calib_{name}.txt")
-        if path is None:
-            raise InputError(f"{folder}: --body needs calib_{name}.txt, here or in the folder above")
-        rows = read_keys(path)
-        part = np.eye(4)
-        part[:3, :3] = turn(path, rows, "R")
-        part[:3, 3] = numbers(path, rows, "T", (3,))
-        mount = part @ mount
-    return mount

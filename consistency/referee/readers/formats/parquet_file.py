@@ -43,15 +43,13 @@ def read_columns(path: Path, refusal: str) -> tuple[dict[str, Array], int]:
     names = table.column_names
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"{path}: column '{one_line(twice[0])}' is duplicated")
+    cells: dict[str, Array] = {}
     with reading(path, refusal):
-        columns = {name: _cells_of_column(name, column) for name, column in zip(names, table.columns, strict=True)}
-        return columns, table.num_rows
-
-
-def _cells_of_column(name: str, column: Any) -> Array:
-    if pa.types.is_decimal(column.type):
-        column = column.cast(pa.float64())
-    if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
-        values: Array = column.to_numpy().astype(float)
-        return values
-    return np.fromiter(column.to_pylist(), object, len(column))
+        for name, column in zip(names, table.columns, strict=True):
+            if pa.types.is_decimal(column.type):
+                column = column.cast(pa.float64())
+            if name != "filter" and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+                cells[name] = column.to_numpy().astype(float)
+            else:
+                cells[name] = np.fromiter(column.to_pylist(), object, len(column))
+    return cells, table.num_rows

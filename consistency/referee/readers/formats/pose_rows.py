@@ -35,7 +35,7 @@ from consistency.referee.readers.formats.columns import (
 )
 from consistency.referee.readers.formats.file_kinds import Head, are_poses, head_of, is_solution
 from consistency.referee.readers.formats.positions import read_solution
-from consistency.referee.readers.formats.sheet import OF_ONE_RUN, TableRows, sheet_of
+from consistency.referee.readers.formats.sheet import TableRows, sheet_of
 from consistency.referee.readers.formats.table_columns import times_of
 from consistency.referee.readers.formats.text_blocks import Lines, increasing, read_numbers, read_rows
 from consistency.referee.readers.options import Reading
@@ -96,7 +96,7 @@ def read_poses(path: Path, true: bool = False, columns: Columns | None = None) -
         return _unnamed(path, true, head)
     if not (found.quaternion or true):
         raise InputError(f"{path}: holds no quaternion; a table of a state is read with --state x,y,z; {naming('qx')}")
-    return _named(path, head, found, true)
+    return _named(head, found, true)
 
 
 def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
@@ -105,7 +105,7 @@ def read_beside(path: Path, columns: Columns | None = None) -> Lines | None:
     found = None if head is None else true_pose_columns(head.names, path)
     if head is None or found is None or not found.quaternion:
         return None
-    lines = _named(path, head, found, True)
+    lines = _named(head, found, True)
     finite = finite_rows(lines.values)
     return replace(lines.rows(finite), rest=None, note=f"{path}: the truth stands in columns beside the estimates")
 
@@ -135,16 +135,14 @@ def on_plane(lines: Lines, unit: str) -> TableRows:
 # --- columns with names ------------------------------------------------------------------------------
 
 
-def _named(path: Path, head: Head, found: PoseColumns, true: bool) -> Lines:
+def _named(head: Head, found: PoseColumns, true: bool) -> Lines:
     """Rows under the names of their columns."""
-    sheet = sheet_of(path, head, head.renaming)
-    if "run" in sheet or "filter" in sheet:
-        raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
-    names = head.names
+    sheet = sheet_of(head)
+    _require_one_run(sheet)
 
     def numbers(places: Sequence[int]) -> list[Array]:
-        columns = [names[place] for place in places]
-        require_units(columns, path)
+        columns = [head.names[place] for place in places]
+        require_units(columns, head.path)
         return list(map(sheet.numbers, columns))
 
     t, unit = times_of(sheet, found.clock, numbers(found.clock.places))
@@ -156,14 +154,21 @@ def _named(path: Path, head: Head, found: PoseColumns, true: bool) -> Lines:
         rest = np.column_stack(numbers(found.rest))
     pose = numbers(found.position + found.quaternion)
     values = np.column_stack([t, *pose, *stated])
-    note = _named_note(path, head, found, true, UNIT_NAMES[unit])
+    note = _named_note(head, found, true, UNIT_NAMES[unit])
     lines = Lines(
-        path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut, columns=sheet.data
+        head.path, values, sheet.line, note, rest=rest, open_line=sheet.open_line, cut=sheet.cut, columns=sheet.data
     )
     return increasing(lines)
 
 
-def _named_note(path: Path, head: Head, found: PoseColumns, true: bool, clock: str) -> str:
+def _require_one_run(sheet: TableRows) -> None:
+    """Refuse a file whose rows are of several runs or estimators."""
+    if "run" in sheet or "filter" in sheet:
+        what = "write such poses to a file for each run and estimator"
+        raise InputError(f"{sheet.path}: column 'run' or 'filter': {what}")
+
+
+def _named_note(head: Head, found: PoseColumns, true: bool, clock: str) -> str:
     of = found.kind
     order = "no orientation"
     if not true:
@@ -172,7 +177,7 @@ def _named_note(path: Path, head: Head, found: PoseColumns, true: bool, clock: s
         clock = "seconds and nanoseconds"
     if found.quaternion:
         order = "quaternion w first" if found.quaternion[3] < found.quaternion[0] else "quaternion w last"
-    note = f"{path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
+    note = f"{head.path}: read as {of}, {len(head.names)} columns, {clock}, {order}"
     if not found.covariance:
         return note
     stated = "covariance"
@@ -512,13 +517,12 @@ def read_plane(path: Path, head: Head | None, motions: bool = False) -> tuple[Ta
     has_poses = len(poses) == len(POSE)
     moving = tuple(poses.values()) if has_poses else rates_in(names)
     require_units([names[place] for place in (*clock.places, *moving)], path)
-    sheet = sheet_of(path, head, head.renaming)
+    sheet = sheet_of(head)
     t, unit = times_of(sheet, clock, [sheet.numbers(names[place]) for place in clock.places])
     pose = sheet.matrix(names[place] for place in moving)
     of = "planar poses"
     if not has_poses:
-        if "run" in sheet or "filter" in sheet:
-            raise InputError(f"{path}: column 'run' or 'filter': {OF_ONE_RUN}")
+        _require_one_run(sheet)
         what = "motions" if motions else "poses"
         of = f"speed and turn rate, each held until the next, integrated to {what}"
         pose = motions_of(t, *pose.T)

@@ -346,8 +346,12 @@ def read_solution(path: Path) -> Fixes:
     if kind is CENTRED:
         place = geodetic(place)
         P = _turned(axes_at(place), P)
+    qualities = "no Q"
+    if "Q" in columns:
+        counts = Counter(columns["Q"].astype(int).tolist())
+        qualities = ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(counts.items()))
     read_as = f"read as a solution of RTKLIB, {len(names) + 1} columns, {_clock_note(solution.clock, t)}"
-    note = f"{path}: {read_as}; {_qualities(columns)}"
+    note = f"{path}: {read_as}; {qualities}"
     values = np.column_stack([t, place, P.reshape(-1, 9)])
     named = {name.partition("(")[0]: columns[name] for name in solution.names if name not in kind}
     lines = Fixes(path, values, found.line, note, cut=found.cut, columns=named, geodetic=kind is not BASELINE)
@@ -440,14 +444,6 @@ def _clock_note(clock: str, t: Array) -> str:
     while leap_seconds(t[0] + count) != count:
         count += 1
     return f"times of GPS as UTC, {count} leap seconds less"
-
-
-def _qualities(columns: dict[str, Array]) -> str:
-    """How many rows are of which quality."""
-    if "Q" not in columns:
-        return "no Q"
-    counts = Counter(columns["Q"].astype(int).tolist())
-    return ", ".join(f"{count} {QUALITY.get(q, f'Q={q}')}" for q, count in sorted(counts.items()))
 
 
 def _covariance(path: Path, columns: dict[str, Array], stated: Sequence[str]) -> Array:

@@ -22,6 +22,7 @@ from consistency.referee.readers.formats.file_kinds import (
     is_plane,
     is_solution,
     is_spatial,
+    separator_of,
     table_files,
     trajectory_files,
 )
@@ -75,7 +76,7 @@ class TextFile:
     def _line(self, line: str, change: Change) -> str:
         """A line with its covariance restated, and no other change; "" where its run or estimator is left out."""
         text = line.rstrip("\r\n")
-        separator = max(",;\t", key=text.count)
+        separator = separator_of(text)
         between = re.escape(separator)
         if separator not in text:
             text = text.strip()
@@ -130,7 +131,7 @@ class TextFile:
 def _with(line: str, fields: Iterable[str]) -> str:
     """A line with fields behind its own, which are separated as these are."""
     text = line.rstrip("\r\n")
-    separator = max(",;\t", key=text.count)
+    separator = separator_of(text)
     return (separator if separator in text else " ").join([text, *fields]) + line[len(text) :]
 
 
@@ -144,8 +145,7 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
     if is_bag(estimates) or estimates.suffix.lower() in ARCHIVES or is_solution(estimates):
         return []
     declared = r.conventions
-    of_bounds = r.statement.level is not None and not r.statement.gaussian
-    if (r.components.columns and not of_bounds) or declared.world or declared.body_axes:
+    if (r.components.columns and not r.statement.is_of_bounds) or declared.world or declared.body_axes:
         return []  # names and axes of the file are not the record's
     state = r.components.state
     found: list[TextFile | None] = []
@@ -165,7 +165,7 @@ def text_files(estimates: Path, r: Reading, name: str = "") -> list[TextFile]:
 
 def _table(path: Path, r: Reading, name: str, run: int | None = None) -> TextFile | None:
     """A table, whose first line names its columns; of one ``run`` where that is given."""
-    of_bounds = r.statement.level is not None and not r.statement.gaussian
+    of_bounds = r.statement.is_of_bounds
     head = head_of(path, r.components.columns if of_bounds else None)
     if head is None or any(column.startswith("own_P") for column in head.names):
         return None

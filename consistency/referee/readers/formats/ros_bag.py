@@ -130,7 +130,12 @@ def _run_on(bag: Path, reader: Any, r: Reading, topic: str, needed: str = "") ->
         raise InputError(f"{bag}: needs --truth-topic{needed}; there are: {_listed(there, reader)}")
     own = _lines(bag, reader, topic)
     true = _lines(bag, reader, truth)
-    notes = _other_frames(bag, (topic, _frames(reader, topic)), (truth, _frames(reader, truth)))
+    notes = []
+    remedies = "add --align where they are not the same", "the poses must be of one body"
+    frames = zip(("world", "body"), _frames(reader, topic), _frames(reader, truth), remedies, strict=True)
+    for which, a, b, advice in frames:  # which may be the same by another name
+        if a and b and a != b:
+            notes.append(f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {truth}; {advice}")
     return SpaceRun(own, true, (bag, f"{truth} of {bag}"), notes=notes)
 
 
@@ -157,18 +162,6 @@ def _stated(path: Path, poses: Sequence[Poses]) -> tuple[list[int], str]:
     note = f"{path}: the variances of {missing} are {values}, so not stated and not judged"
     note += f", as by --axes {','.join(AXES[i] for i in np.flatnonzero(~none))}"
     return np.flatnonzero(~none).tolist(), note if missing else ""
-
-
-def _other_frames(bag: Path, estimates: tuple[str, Frames], truth: tuple[str, Frames]) -> list[str]:
-    """A note on frames of estimates and truth by other names, which may be the same."""
-    topic, own = estimates
-    true_topic, true = truth
-    notes = []
-    remedies = "add --align where they are not the same", "the poses must be of one body"
-    for which, a, b, advice in zip(("world", "body"), own, true, remedies, strict=True):
-        if a and b and a != b:
-            notes.append(f"{bag}: the {which} is '{a}' on {topic}, but '{b}' on {true_topic}; {advice}")
-    return notes
 
 
 # --- topics -----------------------------------------------------------------------------------------

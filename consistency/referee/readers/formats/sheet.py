@@ -20,7 +20,7 @@ from consistency.referee.errors import InputError
 from consistency.referee.extras import require
 from consistency.referee.parsing import MOST_DOF, WHOLE, is_file, keys_once, one_line, reading, require_name
 from consistency.referee.readers.formats.columns import Columns, clock_of, renamed
-from consistency.referee.readers.formats.file_kinds import Head
+from consistency.referee.readers.formats.file_kinds import Head, separator_of
 from consistency.referee.readers.formats.text_blocks import (
     Block,
     FileRows,
@@ -38,7 +38,6 @@ EMPTY = frozenset((  # what pandas and R write for no value
     "", "#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "-NaN", "-nan", "1.#IND", "1.#QNAN", "<NA>", "N/A", "NA",
     "NULL", "NaN", "None", "n/a", "nan", "null",
 ))  # fmt: skip
-OF_ONE_RUN = "write such poses to a file for each run and estimator"  # of a file with these columns
 NIS_DOF = "it is the number of measurements in each nis"  # of a column that is missing
 DOF_NEEDED = "a whole number from 0 to below 2^31"
 DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d)(?::(\d\d(?:[.,]\d+)?))?\s?(Z|UTC|[+-]\d\d:?\d\d)?")
@@ -176,17 +175,17 @@ def read_sheet(path: Path, columns: Columns | None = None) -> TableRows:
     return sheet
 
 
-def sheet_of(path: Path, head: Head, columns: Columns | None = None) -> TableRows:
+def sheet_of(head: Head) -> TableRows:
     """A text file under the names of its ``head``, which may stand in a comment or be apart by white space."""
     if not (head.comment or head.spaced):
-        return read_sheet(path, columns)
+        return read_sheet(head.path, head.renaming)
     header = 0 if head.comment else head.line
     width = max(head.places) + 1
-    lines = read_rows(path, [width], f"{width} columns as named", header)
+    lines = read_rows(head.path, [width], f"{width} columns as named", header)
     data: dict[str, Column] = {}
     for name, place in zip(head.names, head.places, strict=True):
         data.setdefault(name, lines.values[:, place])
-    return TableRows(path, data, lines.line, "line", lines.open_line, lines.cut)
+    return TableRows(head.path, data, lines.line, "line", lines.open_line, lines.cut)
 
 
 def frame_rows(frame: Any, name: str) -> TableRows:
@@ -294,11 +293,6 @@ class CsvTable(LineParser):
         return True
 
 
-def separator_of(line: str) -> str:
-    """What separates the fields of a line: a comma, a semicolon or a tab."""
-    return max(",;\t", key=line.count)
-
-
 def _column(cells: list[str], is_text: bool) -> Column:
     filled: list[Any] = [None if cell in EMPTY else cell for cell in cells]
     if not is_text:
@@ -366,7 +360,16 @@ GPSD = "is a report of gpsd, whose epx, epy and epv are of unknown certainty; so
 
 class _Objects(LineParser):
     def row(self, number: int, line: str) -> dict[str, Any]:
-        return _object(self.path, number, line)
+        with reading(self.path, f"line {number} is not valid JSON"):
+            value = json.loads(line, object_pairs_hook=keys_once)
+            cells = list(_keys("", value))
+        row = dict(cells)
+        where = f"{self.path}, line {number}"
+        if not isinstance(value, dict) or len(row) < len(cells):
+            raise InputError(f"{where}: must be an object, and no key a.b beside b within a")
+        if row.get("class") in ("TPV", "SKY", "GST"):
+            raise InputError(f"{where}: {GPSD}")
+        return row
 
     def is_whole(self, line: str, above: object) -> bool:
         return line.rstrip().endswith("}")
@@ -383,18 +386,6 @@ def _read_json_lines(path: Path) -> TableRows:
     for name in dict.fromkeys(itertools.chain.from_iterable(rows)):
         columns[name] = _cells([row.get(name) for row in rows])
     return TableRows(path, columns, found.line, "line", found.open_line, found.cut)
-
-
-def _object(path: Path, number: int, line: str) -> dict[str, Any]:
-    with reading(path, f"line {number} is not valid JSON"):
-        value = json.loads(line, object_pairs_hook=keys_once)
-        cells = list(_keys("", value))
-    row = dict(cells)
-    if not isinstance(value, dict) or len(row) < len(cells):
-        raise InputError(f"{path}, line {number}: must be an object, and no key a.b beside b within a")
-    if row.get("class") in ("TPV", "SKY", "GST"):
-        raise InputError(f"{path}, line {number}: {GPSD}")
-    return row
 
 
 def _keys(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -169,7 +169,7 @@ def planar_sheet(path: Path, motions: bool = False, renaming: Columns | None = N
     is_table = head is None and not begins_with_numbers(path)
     if head is not None:
         is_table = not head.comment and set(POSE) <= set(head.names)
-    if is_table or not (are_poses(path, head) or are_planar(path, head)):
+    if is_table or not (are_poses(path, head) or are_planar(head)):
         return read_sheet(path, renaming), ""
     from consistency.referee.readers.formats.pose_rows import read_plane
 

@@ -92,13 +92,11 @@ def read_tum(estimates: Path, r: Reading, poses_alone: bool = False) -> list[Est
     stated_as.require_spatial(r.conventions.error, INERTIAL)
     truth_of = _truths(estimates, r)
     files = files_of_runs(estimates, r, None if poses_alone else r.sources.covariance)
-    runs = (_run_of(own, true, P, truth_of, r) for own, true, P in with_progress(files, "reading", "files"))
+    runs = (
+        SpaceRun(read_trajectory(own, columns=r.components.columns), truth_of(true), (own, true), covariance)
+        for own, true, covariance in with_progress(files, "reading", "files")
+    )
     return [poses_without_covariances(estimates, runs, r) if poses_alone else space_estimator(estimates, runs, r)]
-
-
-def _run_of(own: Path, true: Path, covariance: Path | None, truth_of: Callable[[Path], Lines], r: Reading) -> SpaceRun:
-    lines = read_trajectory(own, columns=r.components.columns)
-    return SpaceRun(lines, truth_of(true), (own, true), covariance)
 
 
 class Layout(NamedTuple):

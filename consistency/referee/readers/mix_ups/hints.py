@@ -50,7 +50,6 @@ def hints(
     name: str,
     axes: Sequence[str],
     runs: Sequence[Poses],
-    shift: float = 0.0,
     judged: Sequence[int] | None = None,
     errors_without: ErrorsWithout | None = None,
 ) -> list[str]:
@@ -72,7 +71,7 @@ def hints(
     some = runs
     worlds = errors_without is None
     if errors_without is None:
-        some = thinned(runs, shift)
+        some = thinned(runs)
         errors_without = partial(_errors_without, some, [p.errors() for p in some])
         if is_same(some):
             return [

@@ -141,8 +141,11 @@ def _roots(runs: Sequence[Poses], part: list[int]) -> Iterator[Guess]:
     """Standard deviations, an inverse or a root in the place of the covariance."""
     if any((p.variances < 0).any() for p in runs):
         return
-    beside = _cross_terms(runs, part)
-    yield Guess("its diagonal holds standard deviations; square them", changed(covariance=_squared))
+    P = np.concatenate([submatrices(p.own.covariance, part) for p in runs])
+    beside = P[:, ~np.eye(len(part), dtype=bool)]
+    beside = beside[np.isfinite(beside)]
+    squared = changed(covariance=lambda P: np.square(_without_cross_terms(P)))
+    yield Guess("its diagonal holds standard deviations; square them", squared)
     if beside.any() and (np.abs(beside) <= 1.0).all():
         words = (
             "its diagonal holds standard deviations, and correlations are beside them; multiply each correlation by "
@@ -157,13 +160,6 @@ def _roots(runs: Sequence[Poses], part: list[int]) -> Iterator[Guess]:
         yield Guess("it holds the lower root L of the covariance; write L L'", changed(covariance=_of_root))
 
 
-def _cross_terms(runs: Sequence[Poses], part: list[int]) -> Array:
-    """Numbers beside the diagonals of the rows and columns ``part``, those that are finite, (k,)."""
-    P = np.concatenate([submatrices(p.own.covariance, part) for p in runs])
-    values = P[:, ~np.eye(len(part), dtype=bool)]
-    return np.asarray(values[np.isfinite(values)])
-
-
 def _of_correlations(P: Array) -> Array:
     """D R D of matrices with the deviations D on their diagonals and the correlations R beside."""
     n = P.shape[-1]
@@ -171,10 +167,6 @@ def _of_correlations(P: Array) -> Array:
     R = P.copy()
     R[:, range(n), range(n)] = 1.0
     return np.asarray(R * sigma[:, :, None] * sigma[:, None, :])
-
-
-def _squared(P: Array) -> Array:
-    return np.asarray(np.square(_without_cross_terms(P)))
 
 
 def _without_cross_terms(P: Array) -> Array:
@@ -383,18 +375,13 @@ def _quaternions() -> Iterator[Guess]:
 def _headings() -> Iterator[Guess]:
     """Headings in degrees, of one file or of both, with their variances or without."""
     for of, names in OF.items():
-        fields: dict[str, Function] = dict.fromkeys(names, _radians)
+        fields: dict[str, Function] = dict.fromkeys(names, lambda poses: poses * [1.0, 1.0, DEGREE])
         fine = "truth" not in names
         volume = 0.0 if fine else float(np.log(DEGREE))
         words = f"the headings of {of}{{}} are in degrees; multiply them by pi / 180".format
         yield Guess(words(""), changed(**fields), fine=fine, volume=volume)
         fields["covariance"] = _times(slice(2, 3), DEGREE)
         yield Guess(words(" and their variances"), changed(**fields), fine=fine, volume=volume)
-
-
-def _radians(poses: Array) -> Array:
-    """Poses in the plane whose headings are in degrees, with headings in rad."""
-    return np.asarray(poses * [1.0, 1.0, DEGREE])
 
 
 def _units(width: int, angles: slice) -> Iterator[Guess]:

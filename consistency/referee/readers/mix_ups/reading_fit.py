@@ -112,16 +112,22 @@ class ReadingFit:
         return max(float(size), 1.0)
 
     def right(self, roughly: bool) -> bool:
-        """Whether all is right but for a factor that all components share: within decades, or at a rate of ``ODD``."""
+        """Whether all is right but for a factor that all components share, at a rate of ``ODD``.
+
+        ``roughly`` is within decades, or by chance in few estimates.
+        """
+        ratio = np.square(self.own).mean(axis=0) / self.scale
         if roughly:
-            return bool(self._alike().all())
+            within = np.abs(self.decades[1:] - self.decades[0]) < RIGHT
+            chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
+            return bool((within | chance).all())
         w = self.w / np.sqrt(self.scale)
         pairs = np.triu_indices(self.n, 1)
         products = (w.T @ w / len(w))[pairs]
         middle = distributions.chi2.ppf(0.5, self.n)
         below = float((self.nees / self.scale < middle).mean())
         normal = np.concatenate([w.mean(axis=0), products, [2.0 * below - 1.0]])
-        of_axes = _deviance(np.square(self.own).mean(axis=0) / self.scale)
+        of_axes = _deviance(ratio)
         limit = distributions.chi2.isf(ODD / (len(normal) + len(of_axes)), 1)
         deviances = self.size * np.append(of_axes, np.square(normal))
         return bool((deviances <= limit).all())
@@ -130,13 +136,6 @@ class ReadingFit:
         """Whether the scale is nearly right, and no further off than anything as declared."""
         off = abs(float(self.decades[0]))
         return off < min(SCALE, float(np.abs(declared.decades).max()))
-
-    def _alike(self) -> Indices:
-        """Components whose NEES is off like that of all, within decades or by chance in few estimates, (n,) of bool."""
-        within = np.abs(self.decades[1:] - self.decades[0]) < RIGHT
-        ratio = np.square(self.own).mean(axis=0) / self.scale
-        chance = self.size * _deviance(ratio) <= distributions.chi2.isf(ODD / self.n, 1)
-        return np.asarray(within | chance)
 
     def is_shown(self, scale: float = 0.0) -> bool:
         """Whether enough independent estimates show that all is right, the common factor too, within decades."""
@@ -358,9 +357,9 @@ def _memory(runs: Sequence[Array]) -> float:
 
 
 @np.errstate(invalid="ignore")  # of poses that are not finite
-def is_plausible(runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> bool:
+def is_plausible(runs: Sequence[Poses], judged: Sequence[int]) -> bool:
     """Whether the errors fit as the files were declared, so that no mix-up is to be looked for."""
-    some = thinned(runs, shift)
+    some = thinned(runs)
     if is_same(some):
         return False
     pairs = []
@@ -370,13 +369,13 @@ def is_plausible(runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> 
     return declared is not None and not declared.is_off()
 
 
-def thinned(runs: Sequence[Poses], shift: float) -> list[Poses]:
+def thinned(runs: Sequence[Poses]) -> list[Poses]:
     """Some estimates of some runs, without those that are not finite."""
     most = max(MOST_NUMBERS // runs[0].own.covariance.shape[-1] ** 2, 1)
     runs = runs[:: math.ceil(len(runs) / min(MOST_RUNS, most))]
     share = most // len(runs)
     each = max(min(MOST, most) // len(runs), min(LEAST_EACH, share))
-    return [p.later(shift).some(each).sound() for p in runs]
+    return [p.some(each).sound() for p in runs]
 
 
 def is_same(runs: Sequence[Poses]) -> bool:

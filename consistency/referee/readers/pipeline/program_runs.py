@@ -263,8 +263,11 @@ class ProgramRuns:
             self.failed[run.run] = with_log(str(error).replace(f"{run.folder}/", ""), run)
             return []
         self.found[run.run] = [_without_folder(one, run.folder) for one in found]
-        self._ends[run.run] = _end_of(found[0].runs[0])
-        self.trials[run.run] = f"{run.source} {_digest(found)}"
+        first = found[0].runs[0]
+        self._ends[run.run] = _end_of(first)
+        truth = np.concatenate([first.true.t, first.true.values.ravel()])
+        digest = hashlib.sha256(truth.tobytes()).hexdigest()[:16]
+        self.trials[run.run] = f"{run.source} {digest}"
         return records
 
     def delete_files(self, run: ProgramRun) -> None:
@@ -426,13 +429,6 @@ def _end_of(p: Poses) -> tuple[float, str]:
     if p.true.t[-1] - p.own.t[-1] > LATE * period:
         late = f"its estimates end at {p.own.t[-1]:.6g}, its truth at {p.true.t[-1]:.6g}"
     return float(p.own.t[-1]), late
-
-
-def _digest(found: Sequence[Estimator]) -> str:
-    """Digest of the truth of a run."""
-    p = found[0].runs[0]
-    numbers = np.concatenate([p.true.t, p.true.values.ravel()])
-    return hashlib.sha256(numbers.tobytes()).hexdigest()[:16]
 
 
 def read_table_folder(folder: Path, r: Reading, poses_alone: bool = False) -> list[Estimator]:

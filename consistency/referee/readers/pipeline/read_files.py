@@ -125,10 +125,6 @@ def _is_table_folder(path: Path, r: Reading) -> bool:
     return path.is_dir() and bool(table_files(path)) and (named or not trajectory_files(path, r.components.columns))
 
 
-def _is_archive(path: Path, r: Reading) -> bool:
-    return path.suffix.lower() in ARCHIVES
-
-
 def _is_table(path: Path, r: Reading) -> bool:
     named = r.components.state is not None or r.statement.level is not None
     if path.suffix.lower() in TABLES and (named or not is_spatial(path, r.components.columns)):
@@ -143,7 +139,7 @@ def _is_trajectory(path: Path, r: Reading) -> bool:
 KINDS = (  # a file is of the first that knows it
     Kind("runs of a program", lambda path, r: is_program_runs(path), (), _program_runs),
     Kind("ROS bag", lambda path, r: is_bag(path), (*OF_NAMES, *OF_FILES, *OF_STATES, *OF_BOUNDS), _bags),
-    Kind("archive of arrays", _is_archive, OF_OTHERS_THAN_ARCHIVES, _archive),
+    Kind("archive of arrays", lambda path, r: path.suffix.lower() in ARCHIVES, OF_OTHERS_THAN_ARCHIVES, _archive),
     Kind("table", _is_table, (*OF_BAGS, *OF_TRAJECTORIES), _tables),
     Kind("folder of tables", _is_table_folder, (*OF_BAGS, *OF_TRAJECTORIES), _table_folder),
     Kind("trajectory", _is_trajectory, (*OF_BAGS, *OF_BOUNDS, *OF_STATES), _trajectories),
@@ -267,30 +263,25 @@ def read_recordings(estimates: Path, reading: Reading | None = None) -> list[Rec
 
 
 def _read(name: str, r: Reading, read: Callable[[Reading], list[Record]]) -> list[Record]:
-    """Records under the declared convention, or under each, with what else is declared of them."""
+    """Records under the declared convention, with what else is declared of them.
+
+    To guess it, they have the same runs under each convention that such poses have, the default of the files first.
+    """
 
     def under(convention: str | None) -> list[Record]:
         return _declared(read(r.with_error(convention)), r)
 
-    return _guessed(name, r, under) if r.conventions.error == GUESS else under(r.conventions.error)
-
-
-def _guessed(name: str, r: Reading, read: Callable[[str | None], list[Record]]) -> list[Record]:
-    """Records with the same runs under each convention that such poses have, the default of the files first.
-
-    Parameters
-    ----------
-    read : records under a convention, or under the default
-    """
+    if r.conventions.error != GUESS:
+        return under(r.conventions.error)
     r.refuse(f"--error {GUESS}", NO_GUESS)
-    first = read(None)
+    first = under(None)
     default = first[0].errors.convention
     if default not in (*PLANAR, *SPATIAL) or default == "vector":
         raise InputError(f"--error {GUESS}: is for poses; the errors of {name} are plain differences")
     guesses = {one.name: {default: one} for one in first}
     for kind in SPATIAL if default in SPATIAL else PLANAR:
         if kind not in (default, "vector"):
-            for one in read(kind):
+            for one in under(kind):
                 guesses[one.name][kind] = one
     return [replace(one, guesses=guesses[one.name]) for one in first]
 
@@ -326,32 +317,25 @@ def records_of_found(found: Found, r: Reading) -> list[Record]:
 
 
 def _records(found: Found, r: Reading) -> list[Record]:
-    """Records of what a reader gives."""
+    """Records of what a reader gives; of an estimator with the runs that left no estimates."""
     records: list[Record] = []
     for one in found:
-        if isinstance(one, Estimator):
-            records += _records_of_runs(one, r)
-        elif r.groups.by is None:
+        if isinstance(one, Record):
+            if r.groups.by is not None:
+                from consistency.referee.readers.pipeline.by_column import record_in_groups
+
+                one = record_in_groups(one, r.groups)
             records.append(one)
-        else:
-            from consistency.referee.readers.pipeline.by_column import record_in_groups
+            continue
+        if r.given(OF_AXES):
+            from consistency.referee.readers.axes_and_units import in_axes_of_estimates
 
-            records.append(record_in_groups(one, r.groups))
-    return records
-
-
-def _records_of_runs(e: Estimator, r: Reading) -> list[Record]:
-    """Records of the runs of an estimator, with those that left no estimates."""
-    if r.given(OF_AXES):
-        from consistency.referee.readers.axes_and_units import in_axes_of_estimates
-
-        e = in_axes_of_estimates(e, r)
-    records = []
-    for record in records_of(e, r):
-        own = own_names(record, r)
-        record = with_failed_runs(record, e.failed)
-        errors = replace(record.errors, own_names=own)
-        records.append(replace(record, errors=errors, runs=replace(record.runs, trials=e.trials)))
+            one = in_axes_of_estimates(one, r)
+        for record in records_of(one, r):
+            own = own_names(record, r)
+            record = with_failed_runs(record, one.failed)
+            errors = replace(record.errors, own_names=own)
+            records.append(replace(record, errors=errors, runs=replace(record.runs, trials=one.trials)))
     return records
 
 

@@ -66,23 +66,23 @@ def records_of(e: Estimator, r: Reading) -> list[Record]:
     judged = _judged(e, r)
     if r.statement.ensemble is not None:
         e = _without_cross_terms(e, judged, r.statement.ensemble)
-    if r.groups.by is None:
-        records, _ = _records(e, judged, r)
-        return _with_bounds(records, e, r)
-    from consistency.referee.readers.pipeline.by_column import in_groups, with_values
+    column = None
+    if r.groups.by is not None:
+        from consistency.referee.readers.pipeline.by_column import in_groups, with_values
 
-    e, column = with_values(e, r.groups, judged)
-    records, pairs = _records(e, judged, r)
-    return _with_bounds(in_groups(records, column, e, pairs, r.groups), e, r)
+        e, column = with_values(e, r.groups, judged)
+    pairs: list[Poses] = []
+    if (relative := windows_asked(r)) is not None:
+        records = [_record_of_windows(e, judged, r, relative)]
+    else:
+        records, pairs = _records_of_poses(e, judged, r)
+    if column is not None:
+        records = in_groups(records, column, e, pairs, r.groups)
+    if e.error.bounds is not None:
+        from consistency.referee.readers.formats.bounds import judged_bounds
 
-
-def _with_bounds(records: list[Record], e: Estimator, r: Reading) -> list[Record]:
-    """The records with bounds in place of covariances, where bounds are stated."""
-    if e.error.bounds is None:
-        return records
-    from consistency.referee.readers.formats.bounds import judged_bounds
-
-    return [judged_bounds(record, e, str(r.statement.level)) for record in records]
+        records = [judged_bounds(record, e, str(r.statement.level)) for record in records]
+    return records
 
 
 def with_unit_covariances(e: Estimator) -> Estimator:
@@ -100,14 +100,6 @@ def with_unit_covariances(e: Estimator) -> Estimator:
         runs.append(p.with_values(covariance=unit, stated=np.ones(len(p.own.t), bool)))
     note = f"{e.said}: states no covariance; it is taken as I, which a factor for each component corrects"
     return replace(e, runs=runs).with_error(stated=WHOLE, assumed=True).with_notes(note)
-
-
-def _records(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[list[Record], list[Poses]]:
-    """Records of motions over windows or of poses, and the estimates beside their truth of the latter."""
-    relative = windows_asked(r)
-    if relative is not None:
-        return [_record_of_windows(e, judged, r, relative)], []
-    return _records_of_poses(e, judged, r)
 
 
 def windows_asked(r: Reading) -> Relative | None:
@@ -174,7 +166,7 @@ def _records_of_poses(e: Estimator, judged: Sequence[int], r: Reading) -> tuple[
     causes = [*e.causes]
     are_covariances = e.error.bounds is None or e.error.bounds.gaussian
     if are_covariances and r.statement.ensemble is None and runs[0].own.members is None and not r.sources.repeats:
-        causes = [*_causes(e, runs, shift, judged), *e.causes]
+        causes = [*_causes(e, [p.later(shift) for p in runs], judged), *e.causes]
     notes += [*of_clocks, *causes]
     if e.error.convention:
         notes.append(f"error convention {e.error.convention}: {e.error.definition}")
@@ -349,27 +341,27 @@ def _largest_median(of_runs: Iterable[Array]) -> float:
     return largest
 
 
-def _causes(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
+def _causes(e: Estimator, runs: Sequence[Poses], judged: Sequence[int]) -> list[str]:
     """Mix-ups of the whole state, or of its poses by themselves."""
     if not e.error.in_space:
-        return _hints(e, runs, shift, range(len(e.error.axes)))
+        return _hints(e, runs, range(len(e.error.axes)))
     whole = []
     if len(e.error.axes) > len(AXES):
-        whole = _hints(e, runs, shift, judged)
+        whole = _hints(e, runs, judged)
     of_pose = [i for i in judged if i < len(AXES)]
     if whole or not of_pose:
         return whole
     poses = e.with_error(axes=e.error.axes[: len(AXES)])
-    return _hints(poses, [p.alone() for p in runs], shift, of_pose)
+    return _hints(poses, [p.alone() for p in runs], of_pose)
 
 
-def _hints(e: Estimator, runs: Sequence[Poses], shift: float, judged: Sequence[int]) -> list[str]:
+def _hints(e: Estimator, runs: Sequence[Poses], judged: Sequence[int]) -> list[str]:
     """Hints on mix-ups, which are loaded where the errors do not fit."""
-    if e.error.assumed or is_plausible(runs, shift, judged):
+    if e.error.assumed or is_plausible(runs, judged):
         return []
     from consistency.referee.readers.mix_ups.hints import hints
 
-    return hints(e.said, e.error.axes, runs, shift, judged)
+    return hints(e.said, e.error.axes, runs, judged)
 
 
 # --- records -----------------------------------------------------------------------------------------

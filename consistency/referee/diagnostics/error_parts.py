@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -152,7 +151,7 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
 
 def _is_tolerated(means: RunMeans, settings: Settings) -> bool:
     """Whether the ratio is shown to lie within the tolerance."""
-    test = partial(means.find, gaussian=False)
+    test = means.tests(gaussian=False)
     return equivalence(means.values, means.dof, means.steps, settings, settings.tolerated, test=test).shown
 
 

@@ -6,7 +6,7 @@ those on what breaks without weights by far less.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import calibration_lengths as lengths
 import numpy as np
@@ -55,12 +55,25 @@ def diverging(runs=100, steps=60, end=5, every=10, factor=9.0):
 def test_runs_of_equal_length_have_one_test():
     means = np.random.default_rng(93).chisquare(12, 50) / 12
     both = RunMeans(means, np.full(50, 7), 2)
-    assert both.find(1.3) == both.name(1.3) == scale_test(means / 1.3, 2, 7)
+    assert both.find() == both.name() == scale_test(means, 2, 7)
     assert both.interval(0.9) == ratio_interval(means, 2, 0.9)
     sample = sample_of(make_record("equal", nees=np.random.default_rng(94).chisquare(2, (30, 5)), dof=2), Settings())
     assert sample.early_means is None
     assert sample.run_means().early is None
     assert run_tests(sample, Settings(), {}).named == {}
+
+
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_tests_of_the_means_over_a_number(gaussian):
+    """As if each of the means had been divided by it: of runs alike, of unlike ones, and beyond the reach of chance."""
+    rng = np.random.default_rng(97)
+    means, counts, first = rng.chisquare(9, 60) / 8, rng.integers(3, 30, 60), rng.chisquare(9, 60) / 7
+    for lengths, early in ((np.full(60, 7), None), (counts, None), (counts, RunMeans(first, counts.clip(0, 4), 3))):
+        over = RunMeans(means, lengths, 3, early).tests(gaussian)
+        for size in (0.3, 0.9, 1.1, 4.0):
+            early_over = None if early is None else RunMeans(first / size, early.counts, 3)
+            divided = RunMeans(means / size, lengths, 3, early_over).tests(gaussian)(1.0)
+            np.testing.assert_allclose(astuple(over(size)), astuple(divided), rtol=1e-9)
 
 
 def test_the_larger_p_value_finds_a_fault_and_equal_weights_name_it():

@@ -68,11 +68,11 @@ def test_tests_of_the_means_over_a_number(gaussian):
     """As if each of the means had been divided by it: of runs alike, of unlike ones, and beyond the reach of chance."""
     rng = np.random.default_rng(97)
     means, counts, first = rng.chisquare(9, 60) / 8, rng.integers(3, 30, 60), rng.chisquare(9, 60) / 7
-    for lengths, early in ((np.full(60, 7), None), (counts, None), (counts, RunMeans(first, counts.clip(0, 4), 3))):
-        over = RunMeans(means, lengths, 3, early).tests(gaussian)
+    for steps, early in ((np.full(60, 7), None), (counts, None), (counts, RunMeans(first, counts.clip(0, 4), 3))):
+        over = RunMeans(means, steps, 3, early).tests(gaussian)
         for size in (0.3, 0.9, 1.1, 4.0):
             early_over = None if early is None else RunMeans(first / size, early.counts, 3)
-            divided = RunMeans(means / size, lengths, 3, early_over).tests(gaussian)(1.0)
+            divided = RunMeans(means / size, steps, 3, early_over).tests(gaussian)(1.0)
             np.testing.assert_allclose(astuple(over(size)), astuple(divided), rtol=1e-9)
 
 

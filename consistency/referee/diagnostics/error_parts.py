@@ -463,7 +463,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     scale : p value of the main question, where it comes from elsewhere
     """
     of_runs = sample.run_means()
-    main = of_runs.name()
+    main = of_runs.named
     named = {MAIN: sided_p_value(main, settings)}
     if scale is None:
         scale = sided_p_value(of_runs.find(), settings)
@@ -474,7 +474,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
         whitened = sample.whitened
         in_steps = step_moments(whitened)
         of_axes = {key: sample.run_means(index) for key, index in sample.components.items()}
-        axes = {key: of_axis.name() for key, of_axis in of_axes.items()}
+        axes = {key: of_axis.named for key, of_axis in of_axes.items()}
         p[AXIS] = float("nan")
         if sample.dof > 1:
             find = [of_axis.find() for of_axis in of_axes.values()]

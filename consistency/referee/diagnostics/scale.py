@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -155,13 +156,14 @@ class RunMeans:
         """Steps of the longest run."""
         return int(self.counts.max(initial=0))
 
-    def name(self) -> MeanTest:
+    @cached_property
+    def named(self) -> MeanTest:
         """:func:`scale_test` of runs of equal weight."""
         return scale_test(self.values, self.dof, self.steps)
 
     def find(self) -> MeanTest:
         """The same, with the larger p values of both tests."""
-        return self.tests()(1.0)
+        return self.tests()(1.0) if are_unlike(self.counts) else self.named
 
     def tests(self, gaussian: bool = True) -> Callable[[float], MeanTest]:
         """:meth:`find` of the means over any number."""
@@ -372,7 +374,7 @@ class _Spread(NamedTuple):
 
         The first is moved down to where it would be at a mean of 1, never up.
         """
-        off = float(np.clip(self.log_mean - np.log(size), -self.reach, self.reach))
+        off = max(-self.reach, min(self.log_mean - float(np.log(size)), self.reach))
         by_spread = _at_most_skewness(self.by_spread + min(-self.slope * off, 0.0), ratio, dof)
         return min(by_spread - float(np.sqrt(self.variance)), self.by_likelihood - self.error)
 
@@ -488,8 +490,7 @@ def equivalence(
     top = (share + (1.0 - share) * factor) * (1.0 - unseen)
     bottom = share + (1.0 - share) / factor
 
-    of_means = scale_tests(means, dof, steps, False, weights)
-    scaled = of_means if test is None else test
+    scaled = scale_tests(means, dof, steps, False, weights) if test is None else test
 
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
@@ -504,7 +505,7 @@ def equivalence(
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
-        runs = deciding_runs(of_means(1.0), nearer, settings, low_is_fault)
+        runs = deciding_runs(scaled(1.0), nearer, settings, low_is_fault)
     return equivalent(p_below, p_above, ratio, factor, settings, runs)
 
 

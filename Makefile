@@ -37,7 +37,7 @@ test: .venv/.done
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser"
 
 test-all: .venv/.done
-	$(BIN)/python -m pytest -n 3 --dist worksteal --durations=40 --durations-min=5
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=40 --durations-min=5
 
 calibrate: .venv/.done
 	$(BIN)/python benchmarks/calibration.py \

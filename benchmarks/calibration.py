@@ -44,7 +44,7 @@ MANY = 10**9  # gates: no limit
 BATCH = 25  # gates handed to a worker at once
 CLEAR = 50  # gates after which a quick row ends where its promise is kept as far as it has come
 CHUNK = 2000  # runs of the Kalman filter in memory at once
-POOLED, QUICK_POOLED = 54_000, 6_000  # of them in all: as many as the false alarms at 1 % take
+POOLED, QUICK_POOLED = 54_000, 5_000  # of them in all: as many as the false alarms at 1 %, or 50 quick gates, take
 MODULES = (
     "calibration_monitor",
     "calibration_compare",

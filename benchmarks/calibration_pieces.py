@@ -48,7 +48,7 @@ def study_of(rng: np.random.Generator, convention: str) -> Record:
     """Errors of one study under every convention, of which one is right; the first is the default of files."""
     e = SIGMA * rng.standard_normal((RUNS * POSES, 6))
     estimate = np.column_stack([rng.normal(0, 20, (len(e), 3)), Rotation.random(len(e), random_state=rng).as_quat()])
-    true = np.array([applied(pose, own, convention) for pose, own in zip(estimate, e, strict=True)])
+    true = applied(estimate, e, convention)
     P = np.broadcast_to(np.diag(SIGMA**2), (RUNS, POSES, 6, 6))
     records = {}
     for kind in SPATIAL:
@@ -57,16 +57,17 @@ def study_of(rng: np.random.Generator, convention: str) -> Record:
     return replace(records["so3"], guesses=records)
 
 
-def applied(pose: Array, e: Array, convention: str) -> Array:
-    """The true pose (7,) whose error is e, to first order."""
-    R, turn = Rotation.from_quat(pose[3:]), Rotation.from_rotvec(e[3:])
+def applied(poses: Array, e: Array, convention: str) -> Array:
+    """The true poses (N, 7) whose errors are e (N, 6), to first order."""
+    R, turn = Rotation.from_quat(poses[:, 3:]), Rotation.from_rotvec(e[:, 3:])
     true = turn * R if convention in ("so3", "right") else R * turn
     if convention == "rvec":
-        true = Rotation.from_rotvec(R.as_rotvec() + e[3:])
+        true = Rotation.from_rotvec(R.as_rotvec() + e[:, 3:])
     elif convention == "euler":
-        true = Rotation.from_euler("ZYX", R.as_euler("ZYX") + e[:2:-1])
-    at = {"left": pose[:3] + R.apply(e[:3]), "right": turn.apply(pose[:3]) + e[:3]}.get(convention, pose[:3] + e[:3])
-    return np.append(at, true.as_quat())
+        true = Rotation.from_euler("ZYX", R.as_euler("ZYX") + e[:, :2:-1])
+    position, shift = poses[:, :3], e[:, :3]
+    at = {"left": position + R.apply(shift), "right": turn.apply(position) + shift}.get(convention, position + shift)
+    return np.column_stack([at, true.as_quat()])
 
 
 def rows(quick: bool, seed: int) -> list[dict[str, Any]]:

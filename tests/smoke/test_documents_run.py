@@ -70,7 +70,7 @@ def smaller(words):
         return "--jobs 1 --filter ekf-uvd"  # of one cell
     return {
         "run": "--jobs 1", "tune": "--jobs 1", "simulate": "--runs 4", "challenge": "--minutes 0.1 --jobs 1",
-        "characterise": "--overwrite",
+        "characterise": "--overwrite", "reproduce": "--runs 4",
     }.get(name, "")  # fmt: skip
 
 

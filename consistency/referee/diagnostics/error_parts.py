@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -145,7 +144,7 @@ def excused(given: Sequence[Answer], sample: Sample, tests: Tests, settings: Set
 
 def _is_tolerated(means: RunMeans, settings: Settings) -> bool:
     """Whether the ratio is shown to lie within the tolerance."""
-    test = partial(means.find, gaussian=False)
+    test = means.tests(gaussian=False)
     return equivalence(means.values, means.dof, means.steps, settings, settings.tolerated, test=test).shown
 
 
@@ -452,7 +451,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
     scale : p value of the main question, where it comes from elsewhere
     """
     of_runs = sample.run_means()
-    main = of_runs.name()
+    main = of_runs.named
     named = {MAIN: sided_p_value(main, settings)}
     if scale is None:
         scale = sided_p_value(of_runs.find(), settings)
@@ -463,7 +462,7 @@ def run_tests(sample: Sample, settings: Settings, also: Mapping[str, float], sca
         whitened = sample.whitened
         in_steps = step_moments(whitened)
         of_axes = {key: sample.run_means(index) for key, index in sample.components.items()}
-        axes = {key: of_axis.name() for key, of_axis in of_axes.items()}
+        axes = {key: of_axis.named for key, of_axis in of_axes.items()}
         p[AXIS] = float("nan")
         if sample.dof > 1:
             find = [of_axis.find() for of_axis in of_axes.values()]
@@ -506,7 +505,7 @@ def group_tests(sample: Sample) -> tuple[MeanTest, ...]:
     """Test of the scale in each group of runs and steps by itself; none where groups do not convict."""
     if sample.groups is None or sample.groups.outcome:
         return ()
-    return tuple(sample.in_group(number).by_steps() for number in range(len(sample.groups.names)))
+    return tuple(sample.in_group(number).by_steps()(1.0) for number in range(len(sample.groups.names)))
 
 
 def _distribution(sample: Sample, settings: Settings, distribution: Pit) -> float:

@@ -265,7 +265,7 @@ def ever(values: Array) -> float:
 def _mixture(log_gains: Array) -> Array:
     """Mean over stakes of the product up to each run, (N, stakes) -> (N,)."""
     totals = np.cumsum(log_gains, axis=0)
-    return np.asarray(np.exp(np.minimum(special.logsumexp(totals, axis=1) - np.log(log_gains.shape[1]), 700.0)))
+    return np.asarray(np.exp(np.minimum(np.logaddexp.reduce(totals, axis=1) - np.log(log_gains.shape[1]), 700.0)))
 
 
 def coverage(error: Array, covariance: Array, bound: float = 2.0, counted: Array | None = None) -> Array:

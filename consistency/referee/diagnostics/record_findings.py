@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -294,7 +293,7 @@ def _equivalence(
         low_is_fault=not record.fit.reduced,
         unseen=record.fit.unseen,
         is_whole=True,
-        test=partial(sample.run_means().find, gaussian=False),
+        test=sample.run_means().tests(gaussian=False),
     )
     if inspection is None:
         return shown

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, special
@@ -98,28 +100,38 @@ def scale_test(means: Array, dof: int, steps: int, gaussian: bool = True, weight
     gaussian : False lets nu fall below ``dof``, where only errors with heavy tails can have it
     weights : (runs,), of the runs in the mean, see :class:`Weighted`; None where they are equal
     """
+    return scale_tests(means, dof, steps, gaussian, weights)(1.0)
+
+
+def scale_tests(
+    means: Array, dof: int, steps: int, gaussian: bool = True, weights: Array | None = None
+) -> Callable[[float], MeanTest]:
+    """:func:`scale_test` of ``means`` over any number: their spread relative to their mean is worked out once."""
     runs = len(means)
     if runs == 0:
-        return MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
+        return lambda _: MeanTest(0, float("nan"), float("nan"), float("inf"), float("nan"), float("nan"))
     weighted = weighted_of(means, weights)
-    ratio = weighted.ratio
     least = dof / weighted.squares
-    nu = float(least)
-    spread = float("inf")
+    spread = None
     if runs >= FEW * weighted.squares and (steps > 1 or not gaussian) and means.min() > 0:
-        by_spread, left_out = _log_nu_of_means(weighted.values)
-        by_spread, variance = _at_mean_one(by_spread, left_out, weighted.values, 2.0 / runs)
-        by_spread = _at_most_skewness(by_spread, ratio, dof * weighted.squares / weighted.cubes)
-        by_likelihood, error = _log_nu_of_gamma(means, weighted.weights)
-        safe = by_spread - float(np.sqrt(variance)), float(by_likelihood - error - np.log(weighted.squares))
-        log_nu = min(*safe, float(np.log(dof * steps)))
-        if log_nu > np.log(least) or not gaussian:
-            nu = float(np.exp(log_nu))
-            spread = 2.0 / variance
-    above, below = _tails(ratio, runs * nu, spread)
-    if weighted.weights is not None:
-        above = max(above, _skewed_tail(weighted, dof, nu, spread))
-    return MeanTest(runs, ratio, nu, spread, above, below)
+        spread = _spread_of(means, weighted)
+
+    def test(size: float) -> MeanTest:
+        ratio = weighted.ratio / size
+        nu = float(least)
+        known = float("inf")
+        if spread is not None:
+            log_nu = spread.log_nu(ratio, size, dof * weighted.squares / weighted.cubes)
+            log_nu = min(log_nu, float(np.log(dof * steps)))
+            if log_nu > np.log(least) or not gaussian:
+                nu = float(np.exp(log_nu))
+                known = 2.0 / spread.variance
+        above, below = _tails(ratio, runs * nu, known)
+        if weighted.weights is not None:
+            above = max(above, _skewed_tail(weighted, ratio, dof, nu, known))
+        return MeanTest(runs, ratio, nu, known, above, below)
+
+    return test
 
 
 @dataclass(frozen=True)
@@ -144,26 +156,37 @@ class RunMeans:
         """Steps of the longest run."""
         return int(self.counts.max(initial=0))
 
-    def name(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
-        """:func:`scale_test` of runs of equal weight, with means over ``size``."""
-        return scale_test(self.values / size, self.dof, self.steps, gaussian)
+    @cached_property
+    def named(self) -> MeanTest:
+        """:func:`scale_test` of runs of equal weight."""
+        return scale_test(self.values, self.dof, self.steps)
 
-    def find(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
+    def find(self) -> MeanTest:
         """The same, with the larger p values of both tests."""
-        test = self.name(size, gaussian)
-        if not are_unlike(self.counts):
-            return test
-        by_steps = self.by_steps(size, gaussian)
-        above, below = by_steps.above, by_steps.below
-        if self.early is not None:
-            first = self.early.by_steps(size, gaussian)
-            above = combined_p_value((above, first.above), (1.0 - EARLY, EARLY))
-            below = combined_p_value((below, first.below), (1.0 - EARLY, EARLY))
-        return replace(test, above=max(test.above, above), below=max(test.below, below))
+        return self.tests()(1.0) if are_unlike(self.counts) else self.named
 
-    def by_steps(self, size: float = 1.0, gaussian: bool = True) -> MeanTest:
-        """:func:`scale_test` of runs weighted by their steps."""
-        return scale_test(self.values / size, self.dof, self.steps, gaussian, self.counts)
+    def tests(self, gaussian: bool = True) -> Callable[[float], MeanTest]:
+        """:meth:`find` of the means over any number."""
+        by_runs = scale_tests(self.values, self.dof, self.steps, gaussian)
+        if not are_unlike(self.counts):
+            return by_runs
+        by_steps = self.by_steps(gaussian)
+        by_first_steps = None if self.early is None else self.early.by_steps(gaussian)
+
+        def test(size: float) -> MeanTest:
+            test, long = by_runs(size), by_steps(size)
+            above, below = long.above, long.below
+            if by_first_steps is not None:
+                first = by_first_steps(size)
+                above = combined_p_value((above, first.above), (1.0 - EARLY, EARLY))
+                below = combined_p_value((below, first.below), (1.0 - EARLY, EARLY))
+            return replace(test, above=max(test.above, above), below=max(test.below, below))
+
+        return test
+
+    def by_steps(self, gaussian: bool = True) -> Callable[[float], MeanTest]:
+        """:func:`scale_tests` of runs weighted by their steps."""
+        return scale_tests(self.values, self.dof, self.steps, gaussian, self.counts)
 
     def interval(self, confidence: float = CONFIDENCE) -> Interval:
         """:func:`ratio_interval` that holds 1 if that of either weights does."""
@@ -206,10 +229,9 @@ def spreads_more(means: Array, dof: float, errors: float = 1.0) -> bool:
     """
     if len(means) < FEW or not means.min() > 0:
         return False
-    by_spread, left_out = _log_nu_of_means(means)
-    _, variance = _at_mean_one(by_spread, left_out, means, 2.0 / len(means))
-    by_likelihood, error = _log_nu_of_gamma(means)
-    return bool(min(by_spread + errors * np.sqrt(variance), by_likelihood + errors * error) < np.log(dof))
+    spread = _spread_of(means, weighted_of(means))
+    by_spread = spread.by_spread + errors * np.sqrt(spread.variance)
+    return bool(min(by_spread, spread.by_likelihood + errors * spread.error) < np.log(dof))
 
 
 def spreads_more_in_steps(nees: Array, dof: int) -> bool:
@@ -336,15 +358,45 @@ def _jackknife(a: Array, b: Array) -> float:
     return float((len(a) - 1) / len(a) * ((a - a.mean()) * (b - b.mean())).sum())
 
 
-def _at_mean_one(log_nu: float, left_out: Array, means: Array, floor: float) -> tuple[float, float]:
-    """log nu moved down to where it would be at a mean of 1, never up, and the variance that is left."""
-    log_mean = np.log(_left_out_mean(means))
+class _Spread(NamedTuple):
+    """How much run means differ, relative to their mean: estimates of log nu and what is known of them."""
+
+    by_spread: float
+    variance: float  # of that at a mean of 1
+    log_mean: float
+    slope: float  # of ``by_spread`` with the log of the mean
+    reach: float  # of the log of the mean, no farther than chance carries it
+    by_likelihood: float
+    error: float
+
+    def log_nu(self, ratio: float, size: float, dof: float) -> float:
+        """The smaller estimate for means over ``size``, with the mean ``ratio``, each one error to the safe side.
+
+        The first is moved down to where it would be at a mean of 1, never up.
+        """
+        off = max(-self.reach, min(self.log_mean - float(np.log(size)), self.reach))
+        by_spread = _at_most_skewness(self.by_spread + min(-self.slope * off, 0.0), ratio, dof)
+        return min(by_spread - float(np.sqrt(self.variance)), self.by_likelihood - self.error)
+
+
+def _spread_of(means: Array, weighted: Weighted) -> _Spread:
+    """Spread of run means (runs,), all above 0."""
+    by_spread, left_out = _log_nu_of_means(weighted.values)
+    log_mean = np.log(_left_out_mean(weighted.values))
     of_mean = _jackknife(log_mean, log_mean)
     both = _jackknife(left_out, log_mean)
     slope = both / of_mean if of_mean > 0 else 0.0
-    reach = REACH * np.sqrt(of_mean)  # no farther than chance carries the mean
-    variance = max(_jackknife(left_out, left_out) - slope * both, floor)
-    return log_nu + min(-slope * float(np.clip(np.log(means.mean()), -reach, reach)), 0.0), variance
+    variance = max(_jackknife(left_out, left_out) - slope * both, 2.0 / len(means))
+    by_likelihood, error = _log_nu_of_gamma(means, weighted.weights)
+    return _Spread(
+        by_spread,
+        variance,
+        log_mean=float(np.log(weighted.values.mean())),
+        slope=slope,
+        reach=REACH * float(np.sqrt(of_mean)),
+        by_likelihood=float(by_likelihood - np.log(weighted.squares)),
+        error=float(error),
+    )
 
 
 def _at_most_skewness(log_nu: float, ratio: float, dof: float) -> float:
@@ -374,8 +426,8 @@ def _tails(ratio: float, k: float, spread: float) -> tuple[float, float]:
     return float(above), float(below)
 
 
-def _skewed_tail(weighted: Weighted, dof: int, nu: float, spread: float) -> float:
-    """Upper p value of a mean of run means with unlike weights, which is more skewed than chi-square(k) / k.
+def _skewed_tail(weighted: Weighted, ratio: float, dof: int, nu: float, spread: float) -> float:
+    """Upper p value of a ``ratio`` with unlike weights of runs, which is more skewed than chi-square(k) / k.
 
     Runs whose steps are all one and the same are a weighted sum of chi-squares. Otherwise the gamma distribution has
     the variance 2 / (runs nu) of the mean, and the largest third cumulant that Gaussian errors can have at this
@@ -383,7 +435,6 @@ def _skewed_tail(weighted: Weighted, dof: int, nu: float, spread: float) -> floa
     """
     assert weighted.weights is not None
     runs = len(weighted.weights)
-    ratio = weighted.ratio
     if nu == dof / weighted.squares:
         upper = weighted_chi_square_tail(ratio, np.repeat(weighted.weights / (runs * dof), dof))
     else:
@@ -433,16 +484,13 @@ def equivalence(
     share : of errors of the truth in the covariances of ``means``; the ratio is of the others
     weights : (runs,), of the runs in the mean; None where they are equal
     is_whole : the interval of the two tests is worked out, too
-    test : that of the means over a number, in place of :func:`scale_test`
+    test : that of the means over a number, in place of :func:`scale_tests`
     """
     factor = settings.factor if factor is None else factor
     top = (share + (1.0 - share) * factor) * (1.0 - unseen)
     bottom = share + (1.0 - share) / factor
 
-    def scaled(size: float) -> MeanTest:
-        if test is not None:
-            return test(size)
-        return scale_test(means / size, dof, steps, False, weights)
+    scaled = scale_tests(means, dof, steps, False, weights) if test is None else test
 
     def p_below(ratio: float) -> float:
         size = (share + (1.0 - share) * ratio) * (1.0 - unseen)
@@ -457,7 +505,7 @@ def equivalence(
     runs = None
     if top > 1.0:
         nearer = min(top, 1.0 / bottom) if share and not settings.one_sided else top
-        runs = deciding_runs(scale_test(means, dof, steps, False, weights), nearer, settings, low_is_fault)
+        runs = deciding_runs(scaled(1.0), nearer, settings, low_is_fault)
     return equivalent(p_below, p_above, ratio, factor, settings, runs)
 
 

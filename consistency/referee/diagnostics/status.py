@@ -10,7 +10,7 @@ import numpy as np
 from consistency.referee.diagnostics.error_parts import Tests, run_tests, sided_p_value
 from consistency.referee.diagnostics.nees import anees
 from consistency.referee.diagnostics.sample import Sample
-from consistency.referee.diagnostics.scale import MeanTest, RunMeans, spreads_more, spreads_more_in_steps
+from consistency.referee.diagnostics.scale import MeanTest, RunMeans, scale_test, spreads_more, spreads_more_in_steps
 from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
@@ -255,11 +255,9 @@ def _rank(sample: Sample, step: int) -> float:
 
 def _robust(runs: RunMeans, settings: Settings, questions: int, weighted: bool = False) -> bool:
     """Is the scale found at fault too where the runs differ more than Gaussian errors can?"""
-    test = runs.name
-    if weighted:
-        test = runs.by_steps
-    p_value = sided_p_value(test(gaussian=not spreads_more(runs.values, runs.dof)), settings)
-    return p_value * questions <= SHARES[MAIN] * settings.false_alarm
+    gaussian = not spreads_more(runs.values, runs.dof)
+    test = scale_test(runs.values, runs.dof, runs.steps, gaussian, runs.counts if weighted else None)
+    return sided_p_value(test, settings) * questions <= SHARES[MAIN] * settings.false_alarm
 
 
 def _robust_axis(sample: Sample, tests: Tests, settings: Settings) -> bool:

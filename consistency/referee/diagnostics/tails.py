@@ -114,7 +114,7 @@ def lost_evidence(is_lost: Array, share: float) -> Array:
     q = PARTS * share
     with np.errstate(divide="ignore"):
         gains = np.where(np.asarray(is_lost)[:, None], np.log(q / share), np.log1p(-q) - np.log1p(-share))
-    return np.asarray(np.exp(np.minimum(special.logsumexp(np.cumsum(gains, axis=0), axis=1) - np.log(len(q)), 700.0)))
+    return np.asarray(np.exp(np.minimum(np.logaddexp.reduce(np.cumsum(gains, axis=0), axis=1) - np.log(len(q)), 700.0)))
 
 
 def lost_of(record: Record, nees: Array, dof: int, settings: Settings, any_time: bool = False) -> Lost | None:

@@ -9,7 +9,7 @@ with theta integrated out, and predicted for other data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -22,7 +22,7 @@ from consistency.referee.diagnostics.bias_and_shape import hotelling, t_squared
 from consistency.referee.diagnostics.distributions import weighted_chi_square_tail
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.sample import Sample, sample_of
-from consistency.referee.diagnostics.scale import equivalence, equivalent, scale_test
+from consistency.referee.diagnostics.scale import MeanTest, equivalence, equivalent, scale_tests
 from consistency.referee.diagnostics.verdict_parts import (
     AXIS,
     BIAS,
@@ -194,15 +194,26 @@ class UncertainTruth:
         values = self.by_group[group]
         if not len(values):
             return float("nan")
-        mean = float(self.total.group_means(self.groups[group]).mean()) / self._together
-        return upper_tail(mean, upper_weights(values, ratio))
+        return upper_tail(self._mean_by_group[group] / self._together, upper_weights(values, ratio))
 
     def below(self, group: str = MAIN, ratio: float = 1.0) -> float:
         """p value of the covariance of e being at least ``ratio`` P, likewise."""
         if self.record.truth.shared:
             return 1.0
-        index = self.groups[group]
-        return scale_test(self._alone.group_means(index) / ratio, len(index), self.total.longest).below
+        return self._tests_alone[group](ratio).below
+
+    @cached_property
+    def _mean_by_group(self) -> Mapping[str, float]:
+        """Mean NEES of d by S over its degrees of freedom."""
+        return {key: float(self.total.group_means(index).mean()) for key, index in self.groups.items()}
+
+    @cached_property
+    def _tests_alone(self) -> Mapping[str, Callable[[float], MeanTest]]:
+        """Tests that the covariance of d is P times a number."""
+        return {
+            key: scale_tests(self._alone.group_means(index), len(index), self.total.longest)
+            for key, index in self.groups.items()
+        }
 
     @cached_property
     def _alone(self) -> Sample:
@@ -254,7 +265,7 @@ class UncertainTruth:
             if self.contrasted:
                 share = 0.0
             means = sample.run_means()
-            test = partial(means.find, gaussian=False)
+            test = means.tests(gaussian=False)
             return equivalence(
                 means.values, means.dof, means.steps, settings, factor, share=share, is_whole=True, test=test
             )

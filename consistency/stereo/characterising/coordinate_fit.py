@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -324,13 +324,13 @@ class Rows:
     gap: Indices  # (N,), steps since the row before in the track, 0 in the first
     ridge: Array  # (p,), 1 / variance of a prior about 0 of each coefficient, mostly 0
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Rows of a track that its offset is averaged over, the mean that an analysis of variance has."""
         n = np.bincount(self.track)
         return (len(self.r) - (n**2).sum() / len(self.r)) / max(len(n) - 1, 1)
 
-    @property
+    @cached_property
     def track(self) -> Indices:
         """Number of the track of each row, (N,)."""
         return np.repeat(np.arange(len(self.first)), np.diff(self.first, append=len(self.r)))

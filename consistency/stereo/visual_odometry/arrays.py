@@ -112,11 +112,17 @@ def symmetric_inverses(C: Array) -> tuple[Array, Array]:
         least = np.linalg.eigvalsh(np.where(finite[..., None, None], C, one))[..., 0]
         definite = finite & (least > 0.0)
         return np.linalg.inv(np.where(definite[..., None, None], C, one)), definite
-    cofactors = np.cross(np.roll(C, -1, axis=-2), np.roll(C, -2, axis=-2))
-    det = (C[..., 0, :] * cofactors[..., 0, :]).sum(axis=-1)
-    definite = det > 0.0
-    definite &= (C[..., 0, 0] > 0.0) & (cofactors[..., 2, 2] > 0.0)
-    return cofactors / np.where(definite, det, 1.0)[..., None, None], definite
+    C = np.moveaxis(C, (-2, -1), (0, 1))  # entry by entry over all matrices
+    cofactors = np.empty_like(C)
+    for i in range(3):
+        second, third = C[(i + 1) % 3], C[(i + 2) % 3]
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            cofactors[i, j] = second[k] * third[m] - second[m] * third[k]
+    det = C[0, 0] * cofactors[0, 0] + C[0, 1] * cofactors[0, 1] + C[0, 2] * cofactors[0, 2]
+    definite = (det > 0.0) & (C[0, 0] > 0.0) & (cofactors[2, 2] > 0.0)
+    inverses = cofactors / np.where(definite, det, 1.0)
+    return np.moveaxis(inverses, (0, 1), (-2, -1)), np.asarray(definite)
 
 
 class MatchError(InputError):

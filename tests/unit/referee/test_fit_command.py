@@ -240,7 +240,7 @@ def test_the_command_on_tables(tmp_path, capsys):
         "verdict.json", "report.html", "manifest.json",
     }  # fmt: skip
     page = (tmp_path / "noise" / "report.html").read_text()
-    assert "<p class=\"\">Not corrected, as the interval holds none: " in page  # a note is a sentence there
+    assert '<p class="">Not corrected, as the interval holds none: ' in page  # a note is a sentence there
     assert '<table class="plain wide">' in page  # on a narrow screen each axis by itself
     assert '<td data-head="held-out 10 m">' in page
     if is_installed("plot"):

@@ -6,7 +6,7 @@ those on what breaks without weights by far less.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import calibration_lengths as lengths
 import numpy as np
@@ -55,12 +55,25 @@ def diverging(runs=100, steps=60, end=5, every=10, factor=9.0):
 def test_runs_of_equal_length_have_one_test():
     means = np.random.default_rng(93).chisquare(12, 50) / 12
     both = RunMeans(means, np.full(50, 7), 2)
-    assert both.find(1.3) == both.name(1.3) == scale_test(means / 1.3, 2, 7)
+    assert both.find() == both.named == scale_test(means, 2, 7)
     assert both.interval(0.9) == ratio_interval(means, 2, 0.9)
     sample = sample_of(make_record("equal", nees=np.random.default_rng(94).chisquare(2, (30, 5)), dof=2), Settings())
     assert sample.early_means is None
     assert sample.run_means().early is None
     assert run_tests(sample, Settings(), {}).named == {}
+
+
+@pytest.mark.parametrize("gaussian", [True, False])
+def test_tests_of_the_means_over_a_number(gaussian):
+    """As if each of the means had been divided by it: of runs alike, of unlike ones, and beyond the reach of chance."""
+    rng = np.random.default_rng(97)
+    means, counts, first = rng.chisquare(9, 60) / 8, rng.integers(3, 30, 60), rng.chisquare(9, 60) / 7
+    for steps, early in ((np.full(60, 7), None), (counts, None), (counts, RunMeans(first, counts.clip(0, 4), 3))):
+        over = RunMeans(means, steps, 3, early).tests(gaussian)
+        for size in (0.3, 0.9, 1.1, 4.0):
+            early_over = None if early is None else RunMeans(first / size, early.counts, 3)
+            divided = RunMeans(means / size, steps, 3, early_over).tests(gaussian)(1.0)
+            np.testing.assert_allclose(astuple(over(size)), astuple(divided), rtol=1e-9)
 
 
 def test_the_larger_p_value_finds_a_fault_and_equal_weights_name_it():
@@ -71,7 +84,7 @@ def test_the_larger_p_value_finds_a_fault_and_equal_weights_name_it():
     steps = scale_test(means, 3, int(counts.max()), weights=counts)
     first = scale_test(early.values, 3, 3, weights=early.counts)
     both = RunMeans(means, counts, 3)
-    assert both.name() == runs
+    assert both.named == runs
     assert both.find().above == max(runs.above, steps.above)
     assert both.find().below == max(runs.below, steps.below)
     assert both.find().ratio == runs.ratio
@@ -86,7 +99,7 @@ def test_tests_that_find_opposite_faults_find_none():
     means = np.where(np.arange(200) % 2, 4.0, 0.1)
     counts = np.where(np.arange(200) % 2, 1, 100)
     both = RunMeans(means, counts, 1)
-    assert both.name().above < SURE
+    assert both.named.above < SURE
     assert scale_test(means, 1, 100, weights=counts).below < SURE
     assert both.find().p_value > 0.5
 
@@ -116,7 +129,7 @@ def test_first_steps_are_those_that_nearly_all_runs_have():
 @pytest.mark.parametrize("world", ["aligned", "gives up", "left out"])
 def test_the_scale_of_a_right_filter_is_not_found_wrong_by_how_its_runs_end(world):
     means = sample_in(world, 6000).run_means()
-    assert means.name().p_value < SURE  # what is to be mended
+    assert means.named.p_value < SURE  # what is to be mended
     assert means.find().p_value > SURE
     by_steps = means.interval(1.0 - SURE)
     assert by_steps.holds(1.0)
@@ -133,8 +146,8 @@ def test_axes_are_found_by_both_weights_and_named_by_equal_ones():
     sample = sample_in("goal", 200)
     tests = run_tests(sample, Settings(), {})
     axes = [sample.run_means([i]) for i in range(2)]
-    assert list(tests.axes.values()) == [axis.name() for axis in axes]
-    assert tests.named["scale of an axis"] == 2 * min(axis.name().p_value for axis in axes)
+    assert list(tests.axes.values()) == [axis.named for axis in axes]
+    assert tests.named["scale of an axis"] == 2 * min(axis.named.p_value for axis in axes)
     assert tests.p_values["scale of an axis"] == min(1.0, 2 * min(axis.find().p_value for axis in axes))
 
 

@@ -311,10 +311,13 @@ def test_blocks_that_are_not_stated_are_not_judged(tmp_path, value):
 def test_the_covariance_of_a_true_message(tmp_path):
     from test_fixes import flight
 
+    from consistency.referee.readers.formats.positions import axes_at
+
     place, C = flight()
+    turns = axes_at(place[0]) @ np.swapaxes(axes_at(place), 1, 2)
     bag = write_fixes(tmp_path / "a.bag", 3, place + np.array([1e-7, 1e-7, 0.01]), place, C)
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk", truth_covariance="columns")
-    assert_allclose(r.truth.covariance[0], C, rtol=1e-3, atol=1e-6)  # axes at places 100 m apart
+    assert_allclose(r.truth.covariance[0], turns @ C @ np.swapaxes(turns, 1, 2), rtol=1e-6, atol=1e-12)
     [r] = read_recordings(bag, topic="/fix", truth_topic="/rtk")
     assert any("/rtk" not in note and "which counts as 0" in note for note in r.origin.notes)
     drive = write(tmp_path / "b.bag", 1, "odometry", Drive())

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from consistency.referee.errors import InputError
 from consistency.referee.readers.mix_ups.reading_fit import is_plausible
-from consistency.referee.readers.options import Reading
+from consistency.referee.readers.options import Reading, make_reading
 from consistency.referee.readers.pipeline.by_column import _columns_of
 from consistency.referee.readers.pipeline.records import records_of
 from consistency.referee.readers.places import Places
@@ -161,6 +161,17 @@ def test_errors_that_fit_are_plausible_and_others_are_not(rng):
     half = [p.with_values(estimate=p.own.estimate * [1.0, 1.0, 57.3]) for p in right]
     assert is_plausible(half, [0, 1])
     assert not is_plausible(half, range(3))
+
+
+def test_mix_ups_are_looked_for_at_the_times_that_an_offset_gives(rng):
+    """In 0.3 s the path moves by 3 sigma, which hide what is wrong."""
+    runs = []
+    for run in range(10):
+        p = run_of(rng, 200, run)
+        runs.append(p.with_values(t=p.own.t - 0.3, covariance=np.sqrt(p.own.covariance)))
+    (record,) = records_of(estimator_of(*runs), make_reading(time_offset=0.3))
+    (cause,) = record.origin.causes
+    assert "its diagonal holds standard deviations" in cause
 
 
 def test_a_start_that_is_known_exactly_is_no_estimate(rng):

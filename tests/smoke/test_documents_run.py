@@ -65,7 +65,7 @@ def smaller(words):
     if name == "plan" and "--filter" in words:
         return "--pilot-runs 20"
     if name == "tune" and "--log" not in words:
-        return "--jobs 1 --runs 10"
+        return "--jobs 1 --runs 5"
     if name == "sweep":
         return "--jobs 1 --filter ekf-uvd"  # of one cell
     return {

@@ -16,6 +16,7 @@ from consistency.referee.diagnostics.judge_record import follow, judge, look, sp
 from consistency.referee.diagnostics.maps import clustered_share, map_score, rejection_score
 from consistency.referee.diagnostics.monitor import Alarm, GateShare, Monitor
 from consistency.referee.diagnostics.nees import (
+    Band,
     EProcess,
     Pit,
     anees,
@@ -29,6 +30,7 @@ from consistency.referee.diagnostics.nees import (
     noncredibility,
     pit,
     rmse,
+    simultaneous_band,
 )
 from consistency.referee.diagnostics.number_of_runs import (
     detectable_ratio,
@@ -58,14 +60,7 @@ from consistency.referee.diagnostics.record import (
     TruthFit,
     make_record,
 )
-from consistency.referee.diagnostics.scale import (
-    Band,
-    MeanTest,
-    equivalence,
-    mean_test,
-    ratio_interval,
-    simultaneous_band,
-)
+from consistency.referee.diagnostics.scale import MeanTest, equivalence, mean_test, ratio_interval
 from consistency.referee.diagnostics.tails import Outlier, early_ends, lost_bound, outliers
 from consistency.referee.diagnostics.verdict import MapScore, Verdict
 from consistency.referee.diagnostics.verdict_parts import (

@@ -24,27 +24,21 @@ from consistency.referee.diagnostics.bias_and_shape import (
 )
 from consistency.referee.diagnostics.fault_location import location_of
 from consistency.referee.diagnostics.nees import (
+    Band,
     Pit,
     anees,
     coverage,
     coverage_interval,
     noncredibility,
     pit,
+    pointwise_band,
     rmse,
+    simultaneous_band,
 )
 from consistency.referee.diagnostics.number_of_runs import detectable_ratio
 from consistency.referee.diagnostics.record import Record
 from consistency.referee.diagnostics.sample import ATTITUDE, POSITION, Sample
-from consistency.referee.diagnostics.scale import (
-    Band,
-    MeanTest,
-    RunMeans,
-    acceptance,
-    equivalence,
-    pointwise_band,
-    ratio_interval,
-    simultaneous_band,
-)
+from consistency.referee.diagnostics.scale import MeanTest, RunMeans, acceptance, equivalence, ratio_interval
 from consistency.referee.diagnostics.tails import Outlier, beyond_stated, outliers
 from consistency.referee.diagnostics.verdict_parts import (
     AXIS,

@@ -8,9 +8,9 @@ import numpy as np
 
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import distributions
-from consistency.referee.diagnostics.nees import anees
+from consistency.referee.diagnostics.nees import Band, anees, pointwise_band
 from consistency.referee.diagnostics.sample import Sample
-from consistency.referee.diagnostics.scale import Band, pointwise_band, ratio_interval, run_means
+from consistency.referee.diagnostics.scale import ratio_interval, run_means
 from consistency.referee.diagnostics.verdict_parts import BIAS, MAIN, SCALE, STEP, TINY, Interval, Location, Until
 from consistency.referee.types import Array, Indices
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from consistency.referee.diagnostics.error_parts import VISIBLE
 from consistency.referee.diagnostics.groups import range_name
+from consistency.referee.diagnostics.nees import FEW
 from consistency.referee.diagnostics.number_words import (
     MOST,
     SIDE,
@@ -27,7 +28,6 @@ from consistency.referee.diagnostics.number_words import (
     short,
     since_text,
 )
-from consistency.referee.diagnostics.scale import FEW
 from consistency.referee.diagnostics.status import smaller
 from consistency.referee.diagnostics.verdict import Findings
 from consistency.referee.diagnostics.verdict_parts import (

@@ -14,6 +14,7 @@ from scipy import special
 
 from consistency.referee.defaults import CONFIDENCE, DETECT, FALSE_ALARM, POWER
 from consistency.referee.diagnostics import distributions
+from consistency.referee.diagnostics.nees import FEW
 from consistency.referee.diagnostics.number_of_runs import (
     FEWEST_PLANNED,
     gate_runs,
@@ -22,7 +23,7 @@ from consistency.referee.diagnostics.number_of_runs import (
     required_runs,
 )
 from consistency.referee.diagnostics.record import Record, numbered_axes
-from consistency.referee.diagnostics.scale import FEW, LEAST, MeanTest, deciding_runs, run_means, scale_test
+from consistency.referee.diagnostics.scale import LEAST, MeanTest, deciding_runs, run_means, scale_test
 from consistency.referee.diagnostics.verdict_parts import BIAS, MAIN, SHARES, Interval, Settings, Within
 from consistency.referee.diagnostics.whitening import mean_of_runs, squared_length, whiten
 from consistency.referee.errors import InputError

@@ -14,7 +14,7 @@ import numpy as np
 from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics.bias_and_shape import t_squared
 from consistency.referee.diagnostics.error_parts import accuracy_of, bias_of, error_parts, excused, run_tests
-from consistency.referee.diagnostics.nees import chi2_mean_interval
+from consistency.referee.diagnostics.nees import FEW, chi2_mean_interval
 from consistency.referee.diagnostics.number_of_runs import FEWEST_PLANNED
 from consistency.referee.diagnostics.record import Errors, InnovationRecord, RatioTable, Record
 from consistency.referee.diagnostics.sample import (
@@ -25,7 +25,6 @@ from consistency.referee.diagnostics.sample import (
     sample_of,
 )
 from consistency.referee.diagnostics.scale import (
-    FEW,
     equivalence,
     equivalence_by_betting,
     equivalence_of_total,

@@ -1,4 +1,4 @@
-"""The size of the covariance: is it wrong, is it shown to be right, and in which single steps is it wrong?
+"""The size of the covariance: is it wrong, and is it shown to be right?
 
 Runs are the unit: they are independent, steps are not.
 """
@@ -11,24 +11,22 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
-from consistency.referee.defaults import CONFIDENCE, FALSE_ALARM
+from consistency.referee.defaults import CONFIDENCE
 from consistency.referee.diagnostics import distributions
 from consistency.referee.diagnostics.distributions import combined_p_value, weighted_chi_square_tail
-from consistency.referee.diagnostics.nees import EarlyMeans, anees, anees_interval, e_processes, ever
+from consistency.referee.diagnostics.nees import FEW, EarlyMeans, e_processes, ever
 from consistency.referee.diagnostics.number_of_runs import LARGEST
 from consistency.referee.diagnostics.verdict_parts import MAIN, SHARES, Equivalence, Interval, Settings
 from consistency.referee.diagnostics.whitening import (
     are_unlike,
-    block_slices,
     by_runs,
     by_steps,
     mean_and_count,
 )
 from consistency.referee.types import Array, Indices
 
-FEW = 20  # runs; below, the dependence between steps is not estimated but taken as complete
 LARGE = 1e6  # shape of a Gamma distribution beyond which its information is 1/2 and rounding would rule
 LEAST = 4.0  # degrees of freedom of Student's t in an interval: with fewer it says nothing at all
 SKEWNESS = 0.4  # of the bound on it, that the spread is adjusted by
@@ -38,10 +36,8 @@ EARLY = 0.75  # weight of the first steps in the evidence, where runs have unlik
 REACH = 4.0  # standard errors that chance may carry the mean, where nu is moved to a mean of 1
 ITERATIONS = 5  # of the upper end of an interval and the spread there
 UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
-NOTHING = (float("nan"), float("nan"))
 FARTHEST = 15.0  # log of a ratio, beyond which an interval has no end
 HALVINGS = 16  # of an interval in which an end is looked for
-ZERO = 1e-12  # NEES of errors that differ from 0 by the rounding of numbers alone
 
 
 @dataclass(frozen=True)
@@ -445,13 +441,6 @@ def _skewed_tail(weighted: Weighted, ratio: float, dof: int, nu: float, spread: 
     return float(special.stdtr(spread, float(special.ndtri(upper))))
 
 
-def pointwise_band(alive: Indices, dof: int) -> Array:
-    """95 % interval of the ANEES of each single step, (steps,) -> (steps, 2); NaN without a run."""
-    counts, of_step = np.unique(alive, return_inverse=True)
-    intervals = [anees_interval(dof, int(m), CONFIDENCE) if m > 0 else NOTHING for m in counts]
-    return np.array(intervals).reshape(-1, 2)[of_step]
-
-
 def equivalence(
     means: Array,
     dof: int,
@@ -626,110 +615,3 @@ def deciding_runs(test: MeanTest, factor: float, settings: Settings, low_is_faul
 
     least = min(runs(power, room), runs(float(special.ndtri(1.0 - tail)), fault))
     return None if least > LARGEST else max(int(np.ceil(least)), FEW)
-
-
-@dataclass(frozen=True)
-class Band:
-    """Band in which the ANEES curve of a consistent filter stays in all steps at once."""
-
-    low: Array  # (steps,), NaN where no run has a value
-    high: Array  # (steps,)
-    p_value: float  # of the curve: the smallest false-alarm rate at which it leaves its band; NaN without a step
-    above: Array  # (steps,) of bool
-    below: Array  # (steps,) of bool
-
-    @property
-    def outside(self) -> Array:
-        """Whether the curve is outside in a step, on either side, (steps,) of bool."""
-        return np.asarray(self.above | self.below)
-
-
-def simultaneous_band(
-    nees: Array, dof: int, false_alarm: float = FALSE_ALARM, method: str = "max", allow: str | None = None
-) -> Band:
-    """Band that the ANEES of a consistent filter leaves in any step with probability ``false_alarm`` at most.
-
-    In each step, runs times ANEES is chi-square with runs times ``dof`` degrees of freedom (Bar-Shalom, Li &
-    Kirubarajan 2001, sec. 5.4), turned into a standard normal z. With ``method`` "bonferroni" the rate is
-    divided by the number of steps: exact under any dependence. With "max", the maximum of abs(z), neighbours
-    that move together are counted once: P(max > c) <= sum P(z_k > c) - sum P(z_k > c, z_k+1 > c) (Hunter
-    1976; Worsley 1982), with the second term from the bivariate normal with the correlation of the NEES in
-    neighbouring steps over the runs, in Owen's (1956) T function: 2 Q(c) + 4 sum T(c, a_k), a_k^2 =
-    (1 - rho_k) / (1 + rho_k). Where runs have gaps or end early, step averages are over different runs, and correlate
-    less than the NEES of a run that has both steps: rho_k is that times s / sqrt(N_k N_k+1), where s of the N_k and
-    N_k+1 runs are in both.
-
-    An error that is written with few decimals may be 0. For the lower side such a NEES counts as the smallest that is
-    not 0, so that a step is not "too small" by rounding alone.
-
-    Parameters
-    ----------
-    nees : (runs, steps), NaN where a run has no value
-    allow : "conservative" leaves the lower side open
-
-    Raises
-    ------
-    ValueError
-        Unknown method.
-    """
-    if method not in ("max", "bonferroni"):
-        raise ValueError(f"method must be 'max' or 'bonferroni', got '{method}'")
-    alive = np.isfinite(nees).sum(axis=0)
-    judged = np.flatnonzero(alive > 0)
-    low = np.full(nees.shape[1], np.nan)
-    high = np.full(nees.shape[1], np.nan)
-    none = np.zeros(nees.shape[1], bool)
-    if not len(judged):
-        return Band(low, high, float("nan"), none, none)
-    sides = 1 if allow == "conservative" else 2
-    slopes = None
-    if method == "max" and len(nees) >= FEW:
-        parts = (nees[:, judged[b.start : b.stop + 1]] for b in block_slices(len(judged) - 1, len(nees)))
-        slopes = np.concatenate([_slopes(part) for part in parts])
-
-    def exceedance(c: float) -> float:
-        if slopes is None:
-            return sides * len(judged) * float(special.ndtr(-c))
-        return sides * float(special.ndtr(-c) + 2.0 * special.owens_t(c, slopes).sum())
-
-    c = float(optimize.brentq(lambda x: exceedance(x) - min(false_alarm, 0.999 * exceedance(0.0)), 0.0, 38.0))
-    curve = anees(nees)
-    least = curve + _rounded_to_zero(nees) / np.maximum(alive, 1)
-    counts, of_step = np.unique(alive[judged], return_inverse=True)
-    highest, lowest = np.full(len(counts), -np.inf), np.full(len(counts), np.inf)
-    np.maximum.at(highest, of_step, curve[judged])
-    np.minimum.at(lowest, of_step, least[judged])
-    upper = distributions.chi2.sf(counts * highest, counts * dof)
-    lower = distributions.chi2.cdf(counts * lowest, counts * dof)
-    smallest = float(upper.min() if sides == 1 else min(upper.min(), lower.min()))
-    p_value = min(1.0, exceedance(max(float(-special.ndtri(smallest)), 0.0))) if smallest > 0 else 0.0
-    if sides == 2:
-        low[judged] = (distributions.chi2.ppf(special.ndtr(-c), counts * dof) / counts)[of_step]
-    else:
-        low[judged] = 0.0
-    high[judged] = (distributions.chi2.isf(special.ndtr(-c), counts * dof) / counts)[of_step]
-    with np.errstate(invalid="ignore"):
-        return Band(low, high, p_value, curve > high, least < low)
-
-
-def _rounded_to_zero(nees: Array) -> Array:
-    """Sum of the zeros of each step of (runs, steps), each taken as the smallest NEES that is not 0, (steps,)."""
-    with np.errstate(invalid="ignore"):
-        smallest = float(np.min(nees, initial=np.inf, where=nees > ZERO))
-        zeros = (nees <= ZERO).sum(axis=0)
-    return np.asarray(zeros * smallest if np.isfinite(smallest) else 0.0 * zeros)
-
-
-def _slopes(nees: Array) -> Array:
-    """sqrt((1 - rho) / (1 + rho)) of neighbours among the steps of (runs, steps); rho from 0 to 1."""
-    present = np.isfinite(nees)
-    both = present[:, 1:] & present[:, :-1]
-    shared = both.sum(axis=0)
-    alive = present.sum(axis=0)
-    count = np.maximum(shared, 1)
-    a, b = (np.where(both, part, 0.0) for part in (nees[:, :-1], nees[:, 1:]))
-    a, b = (np.where(both, part - part.sum(axis=0) / count, 0.0) for part in (a, b))
-    scale = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
-    rho = np.where((scale > 0) & (shared >= FEW), (a * b).sum(axis=0) / np.where(scale > 0, scale, 1.0), 0.0)
-    rho = np.clip(rho * shared / np.sqrt(alive[:-1] * alive[1:]), 0.0, 1.0)
-    return np.asarray(np.sqrt((1.0 - rho) / (1.0 + rho)))

@@ -227,7 +227,8 @@ def pilots_of_records(
     InputError
         No such filter, one without truth, or too few runs that did not fail.
     """
-    from consistency.referee.diagnostics.scale import FEW, run_means
+    from consistency.referee.diagnostics.nees import FEW
+    from consistency.referee.diagnostics.scale import run_means
 
     named = {record.name: record for record in records}
     pilots = {}

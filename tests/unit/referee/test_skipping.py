@@ -13,9 +13,9 @@ from records import changed
 import consistency as cs
 from consistency.diagnostics import Settings, make_record
 from consistency.referee.diagnostics.fault_location import until
+from consistency.referee.diagnostics.nees import simultaneous_band
 from consistency.referee.diagnostics.record import Skip, Skipped, skip_of, without_first
 from consistency.referee.diagnostics.sample import sample_of
-from consistency.referee.diagnostics.scale import simultaneous_band
 from consistency.referee.errors import InputError
 from consistency.referee.verdicts.compare_sources import baseline, read_baseline, write_baseline
 from consistency.testing import ConsistencyError, assert_consistent, assert_not_worse

@@ -78,14 +78,14 @@ def test_ctrl_c_keeps_what_is_finished(world, whole, tmp_path, stop_at, monkeypa
     """While runs are done, and while a look is taken after the last of them."""
     with monkeypatch.context() as patch:
         if look:
-            look_at = judge_record.look
+            inspected = judge_record._inspected
 
             def pressed(design, record, spent):
                 if len(record.run_numbers) == 20:
                     raise KeyboardInterrupt
-                return look_at(design, record, spent)
+                return inspected(design, record, spent)
 
-            patch.setattr(judge_record, "look", pressed)
+            patch.setattr(judge_record, "_inspected", pressed)
         else:
             stop_at(14, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):

@@ -154,6 +154,8 @@ def test_refusals(archive, tmp_path, errors):
         cs.judge(cs.read(tmp_path / "bare.npz"), skip="2s")
     with pytest.raises(InputError, match=r"skip=2\.5: must be a whole number of steps"):
         cs.judge(record, skip=2.5)
+    with pytest.raises(ValueError, match=r"^skip 40: nothing of the estimator is left, whose last step is 40"):
+        assert_consistent(errors, identities(errors), skip=STEPS)
 
 
 def test_innovations_without_the_first_steps(rng):

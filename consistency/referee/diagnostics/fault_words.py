@@ -321,28 +321,33 @@ def tails_text(v: Findings) -> str:
 
 
 def innovation_faults(v: Findings, i: Innovations) -> list[str]:
-    """The faults that were found in the innovations: of outliers which they are, and the size of the rest."""
+    """The faults that were found in the innovations."""
     texts = []
-    far = i.outliers
-    if "innovation scale" in v.faults and far is None:
-        size = "smaller"
-        if i.ratio > 1:
-            size = "larger"
-        texts.append(f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})")
-    elif "innovation scale" in v.faults and far is not None:
-        are = "are outliers, the largest"
-        if far.count == 1:
-            are = "is an outlier,"
-        where = v.place(far.step)
-        if v.runs > 1:
-            where = f"{v.run_name(far.run)}, {where}"
-        texts.append(
-            f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} "
-            f"expected); NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
-        )
+    if "innovation scale" in v.faults:
+        texts.append(_innovation_scale(v, i))
     if "innovation whiteness" in v.faults:
         texts.append("innovations correlated over steps")
     return texts
+
+
+def _innovation_scale(v: Findings, i: Innovations) -> str:
+    """That innovations are larger or smaller than stated; of outliers which they are, and the size of the rest."""
+    far = i.outliers
+    if far is None:
+        size = "smaller"
+        if i.ratio > 1:
+            size = "larger"
+        return f"innovations {size} than stated (NIS per degree of freedom {short(i.ratio)})"
+    are = "are outliers, the largest"
+    if far.count == 1:
+        are = "is an outlier,"
+    where = v.place(far.step)
+    if v.runs > 1:
+        where = f"{v.run_name(far.run)}, {where}"
+    return (
+        f"{far.count} of {plural(far.of, 'innovation')} {are} in {where} (NIS {short(far.nis)}, {far.dof} expected); "
+        f"NIS per degree of freedom of the rest {far.rest.ratio:.3f}"
+    )
 
 
 def joint_text(v: Findings, joint: JointScore) -> str:

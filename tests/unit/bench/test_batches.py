@@ -347,6 +347,8 @@ def test_the_manifest_has_the_machines_that_did_runs(xyz, tmp_path, capsys, monk
 
 
 def test_a_backend_is_chosen_by_name():
+    with pytest.raises(cs.InputError, match=r"jobs must be at least 1, .* got 0"):
+        executor_for("local", 0)
     with executor_for("local", 3) as executor:
         assert executor is None
     for options, sentence in (

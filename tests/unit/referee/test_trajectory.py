@@ -48,6 +48,8 @@ def test_each_ellipse_is_drawn_from_near():
     whole, *close_ups = panels(figure(one))
     steps = [int(axes.get_title("left").split()[-1]) - 1 for axes in close_ups]
     assert steps[:2] == [10, 40]  # the worst first
+    places = [axes.get_subplotspec().get_position(axes.figure) for axes in close_ups]
+    assert len({(place.x0, place.y0) for place in places}) == len(close_ups)  # none on top of another
     outlines = lines(whole)[2:-1]
     for axes, step, outline in zip(close_ups, steps, outlines, strict=True):
         (low, high), places = axes.get_xlim(), outline.get_xydata()

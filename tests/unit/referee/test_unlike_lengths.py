@@ -30,6 +30,7 @@ from consistency.referee.diagnostics.nees import EarlyMeans, e_process, e_proces
 from consistency.referee.diagnostics.record_findings import InterimLook, findings_of
 from consistency.referee.diagnostics.sample import sample_of
 from consistency.referee.diagnostics.scale import RunMeans, equivalence_by_betting, ratio_interval, scale_test
+from consistency.referee.diagnostics.status import _robust
 from consistency.referee.diagnostics.verdict_parts import MAIN, answers, named_p_values
 
 SURE = 1e-4
@@ -324,3 +325,11 @@ def test_worlds_have_the_mean_of_their_covariance_by_steps_alone(world):
     excess = np.nansum(sample.nees - sample.dof, axis=1)
     assert abs(excess.mean()) < 6.0 * excess.std() / np.sqrt(len(excess))
     assert sample.early_means is not None
+
+
+def test_a_group_counts_runs_by_their_steps():
+    """Runs that have one step in the group do not make its fault certain."""
+    means = np.r_[np.linspace(2.8, 3.2, 40), np.linspace(0.95, 1.05, 40)]
+    runs = RunMeans(means, np.repeat([1, 200], 40), 3)
+    assert _robust(runs, Settings(), 1)
+    assert not _robust(runs, Settings(), 1, weighted=True)
